@@ -1,0 +1,8 @@
+"""PhIHP as TorchRL components: a physics-informed model, a policy learned in imagination, hybrid planning."""
+
+from __future__ import annotations
+
+from phihp_torchrl.tasks import Task, get_task, register_task
+
+__all__ = ["Task", "get_task", "register_task"]
+__version__ = "0.1.0"

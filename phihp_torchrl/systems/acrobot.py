@@ -1,0 +1,97 @@
+"""A two-link arm that hangs from a hinge (paper, appendix B, equation 7; Sutton, 1996)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.systems.base import Constants, System
+
+
+class Acrobot(System):
+    r"""Two links, both joints driven; :math:`\theta_1 = \theta_2 = 0` hangs down.
+
+    .. math:: M(q)\,\ddot q + c(q, \dot q) = \tau - \mathrm{diag}(b)\,\dot q
+
+    with the friction :math:`b` outside F^p. Without torque on the first joint and without friction
+    these are gymnasium's Acrobot equations in their ``book`` form. Units: rad, rad/s, N·m, kg, m.
+    """
+
+    state_names = ("theta1", "theta2", "theta1_dot", "theta2_dot")
+    action_names = ("torque1", "torque2")
+    angles = ("theta1", "theta2")
+    velocity_of = {"theta1": "theta1_dot", "theta2": "theta2_dot"}
+    default_constants = {
+        "gravity": 9.8,
+        "mass1": 1.0,
+        "mass2": 1.0,
+        "length1": 1.0,
+        "center1": 0.5,
+        "center2": 0.5,
+        "inertia1": 1.0,
+        "inertia2": 1.0,
+    }
+    default_friction = {"joint1": 0.01, "joint2": 0.05}
+
+    def prior(self, state: Tensor, action: Tensor, constants: Constants) -> Tensor:
+        theta1, theta2, omega1, omega2 = state.unbind(-1)
+        torque1, torque2 = self.torques(action)
+        c = self.identifiable(constants)
+        sin2 = theta2.sin()
+        pull2 = c["weight2"] * (theta1 + theta2).sin()
+        pull1 = c["weight1"] * theta1.sin() + pull2
+        swirl = c["coupling"] * sin2
+        rest1 = torque1 - pull1 + swirl * omega2 * (omega2 + 2.0 * omega1)
+        rest2 = torque2 - pull2 - swirl * omega1.square()
+        alpha1, alpha2 = _solve_inertia(theta2, rest1, rest2, c)
+        return torch.stack([omega1, omega2, alpha1, alpha2], -1)
+
+    def friction(self, state: Tensor, action: Tensor) -> Tensor:
+        _, theta2, omega1, omega2 = state.unbind(-1)
+        alpha1, alpha2 = _solve_inertia(
+            theta2,
+            -self.friction_constants["joint1"] * omega1,
+            -self.friction_constants["joint2"] * omega2,
+            self.identifiable(self.constants),
+        )
+        zero = torch.zeros_like(omega1)
+        return torch.stack([zero, zero, alpha1, alpha2], -1)
+
+    def torques(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Torques on both joints for an action ``[*batch, m]``."""
+        return action[..., 0], action[..., 1]
+
+    def identifiable(self, constants: Constants) -> dict[str, Any]:
+        """The five base parameters of a two-link arm: the motion tells no more than these."""
+        m1, m2, l1 = constants["mass1"], constants["mass2"], constants["length1"]
+        lc1, lc2, g = constants["center1"], constants["center2"], constants["gravity"]
+        return {
+            "inertia_a": m1 * lc1**2 + m2 * l1**2 + constants["inertia1"],
+            "inertia_b": m2 * lc2**2 + constants["inertia2"],
+            "coupling": m2 * l1 * lc2,
+            "weight1": g * (m1 * lc1 + m2 * l1),
+            "weight2": g * m2 * lc2,
+        }
+
+
+class ElbowAcrobot(Acrobot):
+    """The classic Acrobot: only the second joint, the elbow, is driven."""
+
+    action_names = ("torque2",)
+
+    def torques(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros_like(action[..., 0]), action[..., 0]
+
+
+def _solve_inertia(
+    theta2: Tensor, rest1: Tensor, rest2: Tensor, base: dict[str, Any]
+) -> tuple[Tensor, Tensor]:
+    """Solve M(q) x = rest for the symmetric 2x2 inertia of the arm."""
+    coupled = base["coupling"] * theta2.cos()
+    m11 = base["inertia_a"] + base["inertia_b"] + 2.0 * coupled
+    m12 = base["inertia_b"] + coupled
+    m22 = base["inertia_b"]
+    determinant = m11 * m22 - m12 * m12
+    return (m22 * rest1 - m12 * rest2) / determinant, (m11 * rest2 - m12 * rest1) / determinant

@@ -1,0 +1,97 @@
+"""CartPole, CartPoleSwingup and its published variant (SPEC section 1)."""
+
+from __future__ import annotations
+
+from math import pi, radians
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.systems import CartPole
+from phihp_torchrl.tasks.base import Box, Task
+from phihp_torchrl.tasks.registry import register_task
+
+POSITION_LIMIT = 2.4
+"""Farthest the cart may be from the middle, in m."""
+ANGLE_LIMIT = radians(12.0)
+"""Farthest the pole may lean, in rad."""
+
+_SYSTEM = CartPole()
+_HALF_LENGTH = _SYSTEM.constants["half_length"]
+
+
+def alive_reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+    """+1 for every step, the failing one included."""
+    return torch.ones_like(next_state[..., 0])
+
+
+def fallen(next_state: Tensor) -> Tensor:
+    """Whether the cart left the track or the pole leans too far."""
+    x, _, theta, _ = next_state.unbind(-1)
+    return (x.abs() > POSITION_LIMIT) | (theta.abs() > ANGLE_LIMIT)
+
+
+def tip_reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+    """exp(-|tip - (0, 1)|²) of the pole's tip (x + 2l sin theta, 2l cos theta), after the step."""
+    x, _, theta, _ = next_state.unbind(-1)
+    tip_x = x + 2 * _HALF_LENGTH * theta.sin()
+    tip_y = 2 * _HALF_LENGTH * theta.cos()
+    return torch.exp(-(tip_x.square() + (tip_y - 1.0).square()))
+
+
+def published_tip_reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+    """exp(-(x + l sin theta)² - (l cos theta)²), after the step: what the published runs maximise.
+
+    It lacks the goal's height, so a pole lying flat scores best and hanging still 389 of 500.
+    """
+    x, _, theta, _ = next_state.unbind(-1)
+    center_x = x + _HALF_LENGTH * theta.sin()
+    center_y = _HALF_LENGTH * theta.cos()
+    return torch.exp(-(center_x.square() + center_y.square()))
+
+
+_UPRIGHT = Box.around((0.0,) * 4, (0.05,) * 4)
+_HANGING = Box.around((0.0, 0.0, pi, 0.0), (0.05,) * 4)
+_SWINGUP_COVERAGE = Box.around((0.0, 0.0, 0.0, 0.0), (3.0, 4.0, pi, 10.0))
+
+register_task(
+    Task(
+        name="cartpole",
+        system=_SYSTEM,
+        action_high=(10.0,),
+        time_step=0.02,
+        max_steps=500,
+        reset=_UPRIGHT,
+        reward=alive_reward,
+        terminated=fallen,
+        coverage=Box.around((0.0,) * 4, (POSITION_LIMIT, 3.0, ANGLE_LIMIT, 3.0)),
+        env_id="phihp/CartPole-v0",
+    )
+)
+register_task(
+    Task(
+        name="cartpole-swingup",
+        system=_SYSTEM,
+        action_high=(10.0,),
+        time_step=0.02,
+        max_steps=500,
+        reset=_HANGING,
+        reward=tip_reward,
+        coverage=_SWINGUP_COVERAGE,
+        goal=Box.around((0.0,) * 4, (0.5, 1.0, 0.5, 1.5)),
+        env_id="phihp/CartPoleSwingup-v0",
+    )
+)
+register_task(
+    Task(
+        name="cartpole-swingup-published",
+        system=_SYSTEM,
+        action_high=(10.0,),
+        time_step=0.02,
+        max_steps=500,
+        reset=_HANGING,
+        reward=published_tip_reward,
+        coverage=_SWINGUP_COVERAGE,
+        env_id="phihp/CartPoleSwingupPublished-v0",
+    )
+)
