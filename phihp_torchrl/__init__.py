@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.dynamics import HybridDynamics
 from phihp_torchrl.tasks import Task, get_task, register_task
 
-__all__ = ["Task", "get_task", "register_task"]
+__all__ = ["HybridDynamics", "Task", "get_task", "register_task"]
 __version__ = "0.1.0"

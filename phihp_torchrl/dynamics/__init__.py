@@ -1,0 +1,17 @@
+"""The model: F^p + F^r as a transition, its loss, and its shape as a TorchRL world model."""
+
+from __future__ import annotations
+
+from phihp_torchrl.dynamics.hybrid import HybridDynamics
+from phihp_torchrl.dynamics.prior import PhysicsPrior, WorldPhysics, perturbed_constants
+from phihp_torchrl.dynamics.residual import ResidualMLP
+from phihp_torchrl.dynamics.world_model import TaskWorldModel
+
+__all__ = [
+    "HybridDynamics",
+    "PhysicsPrior",
+    "ResidualMLP",
+    "TaskWorldModel",
+    "WorldPhysics",
+    "perturbed_constants",
+]
