@@ -12,8 +12,11 @@ from phihp_torchrl.integrators.base import Derivative, Integrator, StateLayout
 class Dopri5(Integrator):
     """Adaptive reference solver, for accuracy rather than speed.
 
-    It chooses its inner steps by the worst error in the batch, so results depend on the batch within
-    the tolerances, and it never compiles as one graph. Velocity limits apply after the step.
+    It chooses its inner steps by the worst error in the batch, so results depend on the batch
+    within the tolerances, and it never compiles as one graph. Velocity limits apply after the step.
+
+    Inner steps are never shorter than a hundredth of the step: dry friction jumps where a velocity
+    changes sign, and a cart that sticks there would ask for a hundred thousand of them.
 
     Args:
         rtol: relative tolerance of an inner step.
@@ -33,6 +36,12 @@ class Dopri5(Integrator):
     ) -> Tensor:
         times = torch.tensor([0.0, time_step], dtype=state.dtype, device=state.device)
         trajectory = odeint(
-            lambda _, s: derivative(s), state, times, method="dopri5", rtol=self.rtol, atol=self.atol
+            lambda _, s: derivative(s),
+            state,
+            times,
+            method="dopri5",
+            rtol=self.rtol,
+            atol=self.atol,
+            options={"min_step": 0.01 * time_step},
         )
         return layout.clip(trajectory[-1])
