@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import phihp_torchrl.envs  # noqa: F401  (registers the gymnasium ids)
 from phihp_torchrl.dynamics import HybridDynamics
 from phihp_torchrl.tasks import Task, get_task, register_task
 

@@ -1,0 +1,21 @@
+"""The real worlds, friction included, as gymnasium environments."""
+
+from __future__ import annotations
+
+from phihp_torchrl.envs.worlds.classic_control import (
+    AcrobotWorld,
+    CartPoleWorld,
+    PendulumWorld,
+    make_task_env,
+    world_class,
+)
+from phihp_torchrl.envs.worlds.task_env import TaskEnv
+
+__all__ = [
+    "AcrobotWorld",
+    "CartPoleWorld",
+    "PendulumWorld",
+    "TaskEnv",
+    "make_task_env",
+    "world_class",
+]
