@@ -1,0 +1,79 @@
+# Everything runs from .venv, which is built on first use and again when it is stale.
+.DEFAULT_GOAL := help
+SHELL := /bin/sh
+
+PYTHON ?= python3
+ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
+STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.installed-docs
+
+# One intra-op thread: two threads on two busy cores are many times slower, not faster.
+ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
+HEADLESS := SDL_VIDEODRIVER=dummy MPLBACKEND=Agg WANDB_MODE=disabled
+
+.PHONY: help demo test lint format types docs bench clean
+
+help: ## print these targets
+	@grep -hE '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
+	@echo
+	@echo '  PYTHON=python3.12  the interpreter for .venv (>= 3.11)'
+	@echo '  ARGS="..."         more arguments for demo, test, bench'
+
+demo: $(STAMP) ## learn PendulumSwingup and watch it swing up
+	$(ONE_THREAD) $(BIN)/python recipes/demo.py $(ARGS)
+
+test: $(STAMP) ## run the tests (ARGS="-m 'not slow'" for the quick ones)
+	$(ONE_THREAD) $(HEADLESS) $(BIN)/python -m pytest -n 2 $(ARGS)
+
+lint: $(STAMP) ## ruff (lint and format) and mypy, changing nothing
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(STAMP) ## let ruff fix and format the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+types: $(STAMP) ## mypy alone
+	$(BIN)/mypy
+
+docs: $(DOCS_STAMP) ## build the documentation into site/
+	$(BIN)/python -m mkdocs build --strict
+
+bench: $(STAMP) ## time the hot paths (benchmarks/)
+	$(ONE_THREAD) $(HEADLESS) $(BIN)/python -m pytest benchmarks --benchmark-only $(ARGS)
+
+clean: ## remove .venv, caches and build products (results/ and outputs/ stay)
+	rm -rf $(VENV) build dist site *.egg-info
+	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# An environment whose interpreter still runs is updated in place, so that a changed
+# pyproject.toml does not pull the rug from under a running job; a broken one is replaced.
+$(STAMP): pyproject.toml constraints.txt
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || { \
+	  command -v "$(PYTHON)" >/dev/null 2>&1 || { \
+	    echo "error: '$(PYTHON)' not found; phihp_torchrl needs Python >= 3.11:" \
+	      "make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }; \
+	  "$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "error: phihp_torchrl needs Python >= 3.11, but '$(PYTHON)' is" \
+	      "$$("$(PYTHON)" --version 2>&1); try: make PYTHON=python3.11 ..." >&2; exit 1; }; \
+	  echo "Creating $(VENV) with $$("$(PYTHON)" --version)"; \
+	  "$(PYTHON)" -m venv --clear $(VENV) 2>/dev/null || { \
+	    "$(PYTHON)" -m venv --clear --without-pip $(VENV) && \
+	    "$(PYTHON)" -m pip --python $(BIN)/python install -q pip; } || { \
+	    rm -rf $(VENV); \
+	    echo "error: '$(PYTHON)' can make no virtual environment with pip;" \
+	      "install its venv module (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }; \
+	}
+	@echo "Installing phihp_torchrl and what it needs into $(VENV) (a few minutes the first time)"
+	@$(PIP) torch
+	@$(PIP) -e ".[dev]"
+	@touch $@
+
+$(DOCS_STAMP): $(STAMP)
+	@$(PIP) -e ".[dev,docs]"
+	@touch $@

@@ -1,0 +1,38 @@
+"""What every test shares: one thread, fixed seeds, and no CUDA tests where there is no CUDA."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+
+SEED = 0
+
+# One intra-op thread: xdist already fills the cores, and sums keep their order.
+torch.set_num_threads(1)
+
+# Compiling and first calls are slow, so no deadline; the same examples on every run.
+settings.register_profile("phihp", deadline=None, derandomize=True)
+settings.load_profile("phihp")
+
+
+@pytest.fixture(autouse=True)
+def seed() -> int:
+    """Seed Python, NumPy and torch before every test; request it to know the number."""
+    random.seed(SEED)
+    np.random.seed(SEED)
+    torch.manual_seed(SEED)
+    return SEED
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip the tests marked ``cuda`` on a machine without it."""
+    if torch.cuda.is_available():
+        return
+    skip = pytest.mark.skip(reason="needs a CUDA device")
+    for item in items:
+        if "cuda" in item.keywords:
+            item.add_marker(skip)
