@@ -21,6 +21,10 @@ class Dopri5(Integrator):
     Args:
         rtol: relative tolerance of an inner step.
         atol: absolute tolerance of an inner step, in the units of the state.
+
+    Raises:
+        ValueError: for tolerances that are not positive, and on a call when any state of the batch
+            is or becomes non-finite.
     """
 
     compiles = False
@@ -35,13 +39,16 @@ class Dopri5(Integrator):
         self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
     ) -> Tensor:
         times = torch.tensor([0.0, time_step], dtype=state.dtype, device=state.device)
-        trajectory = odeint(
-            lambda _, s: derivative(s),
-            state,
-            times,
-            method="dopri5",
-            rtol=self.rtol,
-            atol=self.atol,
-            options={"min_step": 0.01 * time_step},
-        )
+        try:
+            trajectory = odeint(
+                lambda _, s: derivative(s),
+                state,
+                times,
+                method="dopri5",
+                rtol=self.rtol,
+                atol=self.atol,
+                options={"min_step": 0.01 * time_step},
+            )
+        except AssertionError as error:  # torchdiffeq's way to say so
+            raise ValueError(f"state: expected finite values while solving; {error}.") from error
         return layout.clip(trajectory[-1])

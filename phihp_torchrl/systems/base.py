@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -28,7 +29,8 @@ class System(abc.ABC):
         friction_constants: friction coefficients that differ from the declared ones, by name.
 
     Raises:
-        ValueError: for a name that the system does not declare, or a constant that is not positive.
+        ValueError: for a name that the system does not declare, or a constant that is not positive
+            and finite.
     """
 
     state_names: ClassVar[tuple[str, ...]]
@@ -53,11 +55,12 @@ class System(abc.ABC):
         self.friction_constants = _override(
             "friction_constants", self.default_friction, friction_constants
         )
-        if any(not value > 0 for value in self.constants.values()):
-            raise ValueError(f"constants: expected positive values, got {self.constants}.")
-        if any(not value >= 0 for value in self.friction_constants.values()):
+        if any(not 0 < value < math.inf for value in self.constants.values()):
+            raise ValueError(f"constants: expected positive, finite values, got {self.constants}.")
+        if any(not 0 <= value < math.inf for value in self.friction_constants.values()):
             raise ValueError(
-                f"friction_constants: expected non-negative values, got {self.friction_constants}."
+                "friction_constants: expected non-negative, finite values, "
+                f"got {self.friction_constants}."
             )
 
     @abc.abstractmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -36,12 +37,17 @@ class Box:
     def __post_init__(self) -> None:
         if len(self.low) != len(self.high):
             raise ValueError(f"low, high: expected equal lengths, got {self.low}, {self.high}.")
-        if any(not low <= high for low, high in zip(self.low, self.high, strict=True)):
-            raise ValueError(f"low, high: expected low <= high, got {self.low}, {self.high}.")
+        pairs = zip(self.low, self.high, strict=True)
+        if any(not -math.inf < low <= high < math.inf for low, high in pairs):
+            raise ValueError(
+                f"low, high: expected finite low <= high, got {self.low}, {self.high}."
+            )
 
     @classmethod
     def around(cls, center: tuple[float, ...], radius: tuple[float, ...]) -> Box:
         """The box ``center ± radius``."""
+        if len(center) != len(radius):
+            raise ValueError(f"center, radius: expected equal lengths, got {center}, {radius}.")
         pairs = list(zip(center, radius, strict=True))
         return cls(tuple(c - r for c, r in pairs), tuple(c + r for c, r in pairs))
 
@@ -102,7 +108,7 @@ class Task:
     reset: Box
     reward: RewardFn
     terminated: TerminatedFn | None = None
-    velocity_limits: Mapping[str, float] = field(default_factory=dict)
+    velocity_limits: Mapping[str, float] = field(default_factory=dict, hash=False)
     coverage: Box | None = None
     goal: Box | None = None
     exploration_reward: RewardFn | None = None
@@ -115,12 +121,18 @@ class Task:
                 f"action_high: expected {self.system.action_dim} values for "
                 f"{self.system.action_names}, got {self.action_high}."
             )
-        if any(not high > 0 for high in self.action_high):
-            raise ValueError(f"action_high: expected positive bounds, got {self.action_high}.")
-        if not self.time_step > 0:
-            raise ValueError(f"time_step: expected a positive number of seconds, got {self.time_step}.")
-        if not self.max_steps > 0:
-            raise ValueError(f"max_steps: expected a positive number of steps, got {self.max_steps}.")
+        if any(not 0 < high < math.inf for high in self.action_high):
+            raise ValueError(
+                f"action_high: expected positive, finite bounds, got {self.action_high}."
+            )
+        if not 0 < self.time_step < math.inf:
+            raise ValueError(
+                f"time_step: expected a positive number of seconds, got {self.time_step}."
+            )
+        if not (isinstance(self.max_steps, int) and self.max_steps > 0):
+            raise ValueError(
+                f"max_steps: expected a positive whole number of steps, got {self.max_steps}."
+            )
         for name in ("reset", "coverage", "goal"):
             box = getattr(self, name)
             if box is not None and len(box.low) != self.system.state_dim:
