@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gymnasium as gym
 
-from phihp_torchrl.envs.worlds import make_task_env, world_class
+from phihp_torchrl.envs.worlds import make_world, world_class
 from phihp_torchrl.tasks import get_task, list_tasks
 
 TASK_ENV_ID = "phihp/Task-v0"
@@ -24,7 +24,7 @@ def register_envs() -> None:
         Box(-1.0, 1.0, (1,), float32)
     """
     if TASK_ENV_ID not in gym.registry:
-        gym.register(TASK_ENV_ID, entry_point=_path(make_task_env))
+        gym.register(TASK_ENV_ID, entry_point=_path(make_world))
     for name in list_tasks():
         task = get_task(name)
         if task.env_id is not None and task.env_id not in gym.registry:

@@ -6,7 +6,7 @@ from phihp_torchrl.envs.worlds.classic_control import (
     AcrobotWorld,
     CartPoleWorld,
     PendulumWorld,
-    make_task_env,
+    make_world,
     world_class,
 )
 from phihp_torchrl.envs.worlds.task_env import TaskEnv
@@ -16,6 +16,6 @@ __all__ = [
     "CartPoleWorld",
     "PendulumWorld",
     "TaskEnv",
-    "make_task_env",
+    "make_world",
     "world_class",
 ]

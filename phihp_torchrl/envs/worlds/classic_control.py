@@ -70,7 +70,7 @@ def world_class(system: System) -> type[TaskEnv]:
     return TaskEnv
 
 
-def make_task_env(
+def make_world(
     task: str | Task,
     *,
     integrator: str | Integrator | None = None,
