@@ -126,7 +126,7 @@ class System(abc.ABC):
         return torch.stack(columns, -1)
 
     def locate(self, observation: Tensor) -> Tensor:
-        """Map an observation back to the state, angles in [-pi, pi] (inverse of :meth:`observe`)."""
+        """Map an observation back to the state, angles in [-pi, pi]; inverts :meth:`observe`."""
         angles = self.angle_indices
         columns = iter(observation.unbind(-1))
         state: list[Tensor] = []

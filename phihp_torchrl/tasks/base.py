@@ -68,7 +68,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Task:
-    """A control task on a :class:`~phihp_torchrl.systems.System`, as data (SPEC's six are built so).
+    """A control task on a :class:`~phihp_torchrl.systems.System`, as data; SPEC's are built so.
 
     Args:
         name: what recipes call it, e.g. ``"pendulum-swingup"``.
@@ -80,11 +80,11 @@ class Task:
         reward: reward of a transition, a pure function of tensors.
         terminated: whether the next state ends the episode; ``None`` if none does.
         velocity_limits: bound on ``|velocity|`` by name; absent velocities have none.
-        coverage: the states that imagination should know, a wide box around all that the task meets.
-            Defaults to the reset box.
+        coverage: the states that imagination should know, a wide box around all that the task
+            meets. Defaults to the reset box.
         goal: states around the goal, worth imagining from where the goal is hard to reach.
-        exploration_reward: what to plan for while collecting data, where ``reward`` is too sparse to
-            move the system. Defaults to ``reward``.
+        exploration_reward: what to plan for while collecting data, where ``reward`` is too sparse
+            to move the system. Defaults to ``reward``.
         integrator: how the world integrates, by name.
         env_id: id of the gymnasium environment of this world, if there is one.
 
@@ -147,8 +147,10 @@ class Task:
     layout: StateLayout = field(init=False, repr=False, compare=False)
     """Positions, velocities and their limits, for integrators."""
 
-    def step(self, state: Tensor, action: Tensor, integrator: str | Integrator | None = None) -> Tensor:
-        """One step of the real world, friction included: ``[*batch, n], [*batch, m] -> [*batch, n]``.
+    def step(
+        self, state: Tensor, action: Tensor, integrator: str | Integrator | None = None
+    ) -> Tensor:
+        """One step of the real world with friction, ``[*batch, n], [*batch, m] -> [*batch, n]``.
 
         The action is clipped to its bounds and held for ``time_step`` seconds.
         """
@@ -160,7 +162,10 @@ class Task:
     def clip_action(self, action: Tensor) -> Tensor:
         """Clip an action ``[*batch, m]`` to its bounds."""
         return torch.stack(
-            [a.clamp(-high, high) for a, high in zip(action.unbind(-1), self.action_high, strict=True)],
+            [
+                a.clamp(-high, high)
+                for a, high in zip(action.unbind(-1), self.action_high, strict=True)
+            ],
             -1,
         )
 
