@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import phihp_torchrl.envs  # noqa: F401  (registers the gymnasium ids)
 from phihp_torchrl.dynamics import HybridDynamics
+from phihp_torchrl.envs import WorldModelEnv  # (importing envs registers the gymnasium ids)
 from phihp_torchrl.tasks import Task, get_task, register_task
 
-__all__ = ["HybridDynamics", "Task", "get_task", "register_task"]
+__all__ = ["HybridDynamics", "Task", "WorldModelEnv", "get_task", "register_task"]
 __version__ = "0.1.0"

@@ -114,10 +114,10 @@ class HybridDynamics(nn.Module):
         return cls(task, prior=prior, residual=None, integrator=integrator)
 
     @classmethod
-    def oracle(cls, task: Task) -> HybridDynamics:
-        """The world itself: true constants, friction and integrator; nothing to learn."""
+    def oracle(cls, task: Task, *, integrator: str | Integrator | None = None) -> HybridDynamics:
+        """The world itself: true constants, friction, its integrator by default; nothing to learn."""
         prior = WorldPhysics(task.system)
-        return cls(task, prior=prior, residual=None, integrator=task.integrator)
+        return cls(task, prior=prior, residual=None, integrator=integrator or task.integrator)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; actions are clipped."""

@@ -2,9 +2,28 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.envs.batched import make_task_env
 from phihp_torchrl.envs.registration import register_envs
+from phihp_torchrl.envs.start_states import (
+    BoxStates,
+    DataStates,
+    MixtureStates,
+    StartStates,
+    make_start_states,
+)
+from phihp_torchrl.envs.world_model import WorldModelEnv
 from phihp_torchrl.envs.worlds import TaskEnv
 
-__all__ = ["TaskEnv", "register_envs"]
+__all__ = [
+    "BoxStates",
+    "DataStates",
+    "MixtureStates",
+    "StartStates",
+    "TaskEnv",
+    "WorldModelEnv",
+    "make_start_states",
+    "make_task_env",
+    "register_envs",
+]
 
 register_envs()
