@@ -1,0 +1,9 @@
+"""Trained agents, whole: ready to act, to save and to load."""
+
+from __future__ import annotations
+
+from phihp_torchrl.deployment.agent import Agent
+from phihp_torchrl.deployment.files import load_agent, save_agent
+from phihp_torchrl.deployment.reading import AgentError
+
+__all__ = ["Agent", "AgentError", "load_agent", "save_agent"]
