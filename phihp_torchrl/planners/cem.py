@@ -1,0 +1,461 @@
+"""Hybrid planning as a TorchRL module: observation in, action out."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import MPCPlannerBase
+
+from phihp_torchrl.planners.core import Plan, plan
+from phihp_torchrl.planners.functions import EnvModel, smallest, tensor_function
+from phihp_torchrl.planners.memory import PlanMemory
+from phihp_torchrl.planners.scoring import ActionBounds, Problem
+from phihp_torchrl.planners.settings import PlanSettings
+
+_logger = logging.getLogger(__name__)
+
+
+class CEMPlanner(MPCPlannerBase):
+    """Plan with the cross-entropy method and a policy as a prior (PhIHP, section 4.3).
+
+    At each call it proposes action sequences, some by the actor rolled out in the model and the
+    others at random, scores them by imagined rewards and by Q beyond the horizon, refits a Gaussian
+    to the elites, samples from it and so on, and acts with its mean. Without an actor and Q it is
+    plain CEM. A score that is not finite never wins, and where all are bad the actor acts.
+
+    It takes the place of :class:`torchrl.modules.CEMPlanner` and its first arguments, except that
+    the Gaussian starts with the action bounds as its scale, rewards are discounted, and of what a
+    step leaves only ``"terminated"`` ends a sequence (running out of steps does not; see
+    ``done_keys``).
+
+    It plans on any stateless environment. One that offers a ``tensor_model``, as
+    :class:`~phihp_torchrl.WorldModelEnv` does, is planned on with pure tensor functions, faster and
+    compiled if you like; others are stepped. Both give the same action for the same noise.
+
+    References: the cross-entropy method, https://doi.org/10.1007/s10479-005-5724-z; PhIHP,
+    https://arxiv.org/abs/2407.02217.
+
+    Args:
+        env: the model to plan on, an environment of batch size ``[]``.
+        planning_horizon: actions in a sequence, ``H``.
+        optim_steps: iterations of sampling, scoring and refitting, ``I``.
+        num_candidates: sequences scored in each iteration, the actor's included (paper: 220).
+        top_k: elites that the Gaussian is refitted to.
+        reward_key: where a step leaves the reward.
+        action_key: the action.
+        actor: a module that writes ``action_key``, in physical units.
+        qvalue: a module that reads observation and action and writes ``value_key``,
+            ``[*batch, 1]``; of several values, ``[*batch, critics]`` or stacked
+            ``[critics, *batch, 1]``, the smallest counts. Needs an actor, which acts beyond the
+            horizon.
+        num_policy_candidates: how many of the first iteration's ``num_candidates`` come from the
+            actor (paper: 20). The first of these is the actor's own sequence, without noise.
+        policy_noise: std of the noise on the others, in units of the action's half-range, as are
+            all further stds and clips (for an action without bounds, in its own units).
+        policy_noise_clip: bound on that noise.
+        alpha: weight of Q beyond the horizon; without ``qvalue`` it has no effect.
+        gamma: discount, of rewards without Q as well.
+        num_kept_elites: elites that compete again in the next iteration, beside its
+            ``num_candidates``.
+        init_std: std of the first iteration's random candidates.
+        min_std: floor of the refitted std.
+        select: act with the refitted ``"mean"`` or with the ``"best"`` sequence met.
+        compare_with_actor: whether the actor's own sequence competes in every iteration, and is
+            what the planner does unless its plan scores higher. ``False`` as published. No effect
+            without ``num_policy_candidates``.
+        actor_margin: by how much a plan must score higher for that.
+        replan_every: steps of one plan to act before the next, ``RH``.
+        warm_start: start from the previous plan, shifted, where an episode goes on.
+        observation_key: what the tensor model is given. Defaults to ``"observation"``, or the only
+            observation there is.
+        done_keys: after which flags of a step nothing counts any more. Defaults to all of the
+            environment's that end in ``"terminated"``.
+        value_key: what ``qvalue`` writes.
+        is_init_key: bool that is true where an episode starts (see
+            :class:`torchrl.envs.InitTracker`); with ``replan_every`` and ``warm_start`` it makes
+            the planner forget. Without it, call :meth:`reset`.
+        backend: ``"tensor"``, ``"env"``, or ``"auto"`` for the first where it can be.
+        compile: whether to compile the plan as one full graph; a dict is passed to
+            :func:`torch.compile`. Needs the tensor backend and is left out otherwise.
+        generator: source of the noise, on the environment's device. Defaults to torch's global one.
+
+    Raises:
+        ValueError: for an argument out of range or a key that is not there; when planning, for an
+            observation that is missing, not finite, or of the wrong shape, dtype or device.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from phihp_torchrl import CEMPlanner, HybridDynamics, WorldModelEnv, get_task
+        >>> from phihp_torchrl.dynamics import TaskWorldModel
+        >>> task = get_task("pendulum")
+        >>> env = WorldModelEnv(TaskWorldModel(task, HybridDynamics.oracle(task)))
+        >>> planner = CEMPlanner(
+        ...     env, planning_horizon=15, optim_steps=3, num_candidates=100, top_k=10, gamma=1.0
+        ... )
+        >>> observation = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 1.0]])
+        >>> planner(TensorDict(observation=observation, batch_size=[2]))["action"].shape
+        torch.Size([2, 1])
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        planning_horizon: int,
+        optim_steps: int,
+        num_candidates: int,
+        top_k: int,
+        reward_key: NestedKey = ("next", "reward"),
+        action_key: NestedKey = "action",
+        *,
+        actor: TensorDictModuleBase | None = None,
+        qvalue: TensorDictModuleBase | None = None,
+        num_policy_candidates: int = 0,
+        policy_noise: float = 0.05,
+        policy_noise_clip: float = 0.3,
+        alpha: float = 1.0,
+        gamma: float = 0.99,
+        num_kept_elites: int = 0,
+        init_std: float = 1.0,
+        min_std: float = 0.0,
+        select: str = "mean",
+        compare_with_actor: bool = True,
+        actor_margin: float = 0.0,
+        replan_every: int = 1,
+        warm_start: bool = False,
+        observation_key: NestedKey | None = None,
+        done_keys: NestedKey | Sequence[NestedKey] | None = None,
+        value_key: NestedKey = "state_action_value",
+        is_init_key: NestedKey = "is_init",
+        backend: str = "auto",
+        compile: bool | dict[str, Any] = False,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        settings = PlanSettings(
+            planning_horizon=planning_horizon,
+            optim_steps=optim_steps,
+            num_candidates=num_candidates,
+            top_k=top_k,
+            num_policy_candidates=num_policy_candidates,
+            policy_noise=policy_noise,
+            policy_noise_clip=policy_noise_clip,
+            alpha=alpha,
+            gamma=gamma,
+            num_kept_elites=num_kept_elites,
+            init_std=init_std,
+            min_std=min_std,
+            select=select,
+            compare_with_actor=compare_with_actor,
+            actor_margin=actor_margin,
+        )
+        action_key, reward_key = unravel_key(action_key), unravel_key(reward_key)
+        action_spec = _action_spec(env, action_key)
+        super().__init__(env, action_key=action_key)
+        self.action_spec = action_spec
+        self.settings = settings
+        self.action_key, self.reward_key = action_key, reward_key
+        self.value_key, self.is_init_key = unravel_key(value_key), unravel_key(is_init_key)
+        self.default_done_keys = done_keys is None
+        self.done_keys = _done_keys(env, done_keys)
+        self.observation_key = _observation_key(env, observation_key)
+        self.actor, self.qvalue = actor, qvalue
+        self.generator = generator
+        self._check_modules()
+        _check_reward(env, reward_key)
+
+        low, high = _limits(action_spec)
+        for name, tensor in (("low", low), ("high", high)):
+            self.register_buffer(f"_action_{name}", tensor, persistent=False)
+
+        if warm_start and num_policy_candidates == num_candidates:
+            raise ValueError(
+                "warm_start: expected random candidates to start from the previous plan, got "
+                f"num_policy_candidates={num_policy_candidates} of num_candidates={num_candidates}."
+            )
+        if isinstance(replan_every, bool) or not isinstance(replan_every, int):
+            raise ValueError(f"replan_every: expected an integer, got {replan_every!r}.")
+        if not 1 <= replan_every <= planning_horizon:
+            raise ValueError(
+                f"replan_every: expected 1 to planning_horizon={planning_horizon}, "
+                f"got {replan_every}."
+            )
+        stateless = replan_every == 1 and not warm_start
+        self.memory = None if stateless else PlanMemory(replan_every, warm_start)
+
+        reason = self._why_not_tensors()
+        if backend not in ("auto", "tensor", "env"):
+            raise ValueError(f"backend: expected 'auto', 'tensor' or 'env', got {backend!r}.")
+        if backend == "tensor" and reason:
+            raise ValueError(f"backend: expected 'env' or 'auto', got 'tensor', but {reason}.")
+        self.uses_tensors = backend != "env" and not reason
+        self._compile = compile
+        self._planning_function: Callable[..., Plan] | None = None
+        if not self.uses_tensors:
+            level = logging.WARNING if compile else logging.INFO
+            _logger.log(
+                level,
+                "CEMPlanner steps the environment%s: %s.",
+                ", which is not compiled" if compile else "",
+                reason or "backend='env'",
+            )
+        if not self._has_tensor_model():
+            batch_size = tuple(env.batch_size)
+            if batch_size:
+                raise ValueError(f"env: expected batch size [], got {list(batch_size)}.")
+        if self.uses_tensors or self._has_tensor_model():
+            self.in_keys = [self.observation_key]
+        self._checked = _specs(env, self.in_keys)
+
+    # Construction: what fits together.
+
+    def _has_tensor_model(self) -> bool:
+        # A transformed environment lends its base's attributes, and its transforms would be lost.
+        return (
+            not isinstance(self.env, TransformedEnv)
+            and getattr(self.env, "tensor_model", None) is not None
+        )
+
+    def _why_not_tensors(self) -> str | None:
+        """Why the environment must be stepped, if so."""
+        if not self._has_tensor_model():
+            return f"{type(self.env).__name__} has no tensor_model of its own"
+        if self.observation_key is None:
+            return "the environment has several observations and observation_key says not which"
+        if self.reward_key != ("next", "reward") or not self.default_done_keys:
+            return "reward_key or done_keys are not those of the tensor model"
+        if len(self.action_spec.shape) != 1:
+            return f"actions of shape {list(self.action_spec.shape)} are not vectors"
+        known = {self.observation_key, self.action_key}
+        for name, module in (("actor", self.actor), ("qvalue", self.qvalue)):
+            if module is not None and not set(module.in_keys) <= known:
+                return f"{name} reads {module.in_keys}, not only {self.observation_key!r}"
+        return None
+
+    def _check_modules(self) -> None:
+        actor, qvalue = self.actor, self.qvalue
+        if actor is None and self.settings.num_policy_candidates:
+            raise ValueError(
+                "actor: expected a module to propose num_policy_candidates="
+                f"{self.settings.num_policy_candidates} sequences, got None."
+            )
+        if actor is None and qvalue is not None:
+            raise ValueError(
+                "actor: expected a module to act beyond the horizon for qvalue, got None."
+            )
+        for name, module, key in (
+            ("actor", actor, self.action_key),
+            ("qvalue", qvalue, self.value_key),
+        ):
+            if module is not None and key not in (keys := getattr(module, "out_keys", [])):
+                raise ValueError(
+                    f"{name}: expected a TensorDict module that writes {key!r}, "
+                    f"got {type(module).__name__} that writes {list(keys)}."
+                )
+        if actor is not None and self.action_key in actor.in_keys:
+            raise ValueError(f"actor: expected no {self.action_key!r} among its in_keys.")
+
+    def _build(self) -> Callable[..., Plan]:
+        """The plan as a function of observation, noise and mean. Not kept in copies."""
+        action_shape = self.action_spec.shape
+        action_dim = self._action_low.numel()
+        if self.uses_tensors:
+            model: Any = self.env.tensor_model
+        else:
+            model = EnvModel(
+                self.env, self.action_key, action_shape, self.reward_key, self.done_keys
+            )
+
+        def read(observation: Any, key: NestedKey) -> Tensor:
+            return observation if isinstance(observation, Tensor) else observation.get(key)
+
+        act = value = None
+        if self.actor is not None:
+            actor_keys = list(self.actor.in_keys)
+            actor_function = tensor_function(self.actor, self.action_key)
+
+            def act(observation: Any) -> Tensor:
+                action = actor_function(*(read(observation, key) for key in actor_keys))
+                return action.reshape(-1, action_dim)
+
+        if self.qvalue is not None:
+            value_keys, action_key = list(self.qvalue.in_keys), self.action_key
+            value_function = tensor_function(self.qvalue, self.value_key)
+
+            def value(observation: Any, action: Tensor) -> Tensor:
+                action = action.reshape(-1, *action_shape)
+                return smallest(
+                    value_function(
+                        *(
+                            action if key == action_key else read(observation, key)
+                            for key in value_keys
+                        )
+                    )
+                )
+
+        bounds = ActionBounds.from_limits(self._action_low, self._action_high)
+        problem = Problem(model=model, bounds=bounds, actor=act, value=value)
+        function = partial(plan, problem=problem, settings=self.settings)
+        if self._compile and self.uses_tensors:
+            options = dict(self._compile) if isinstance(self._compile, dict) else {}
+            return torch.compile(function, **{"fullgraph": True, **options})
+        return function
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The function holds on to these very modules; a copy builds its own.
+        return {**super().__getstate__(), "_planning_function": None}
+
+    def _apply(self, *args: Any, **kwargs: Any) -> CEMPlanner:
+        self._planning_function = None  # it holds the bounds as they were
+        return super()._apply(*args, **kwargs)
+
+    # Planning.
+
+    def reset(self) -> None:
+        """Forget the previous plan: a new episode starts."""
+        if self.memory is not None:
+            self.memory.clear()
+
+    @torch.no_grad()
+    def planning(self, tensordict: TensorDictBase, noise: Tensor | None = None) -> Tensor:
+        """Plan from ``tensordict``.
+
+        Args:
+            tensordict: the observations, of any batch size.
+            noise: standard normal, :meth:`PlanSettings.noise_shape`. Drawn if absent.
+
+        Returns:
+            The action ``[*batch, *action_shape]``.
+        """
+        batch = tensordict.batch_size
+        if self.memory is None:
+            actions = self.plan(tensordict, noise).actions
+            return actions[..., 0, :].reshape(*batch, *self.action_spec.shape)
+        is_init = tensordict.get(self.is_init_key, None)
+        if is_init is not None:
+            is_init = is_init.reshape(batch)
+        center = ActionBounds.from_limits(self._action_low, self._action_high).center
+        action = self.memory.act(
+            lambda mean: self.plan(tensordict, noise, mean).actions,
+            batch,
+            is_init,
+            center.expand(self.settings.planning_horizon, -1),
+        )
+        return action.reshape(*batch, *self.action_spec.shape)
+
+    @torch.no_grad()
+    def plan(
+        self,
+        tensordict: TensorDictBase,
+        noise: Tensor | None = None,
+        mean: Tensor | None = None,
+    ) -> Plan:
+        """The whole sequence and its score; remembers nothing.
+
+        Args:
+            tensordict: the observations, of any batch size.
+            noise: standard normal, :meth:`PlanSettings.noise_shape`. Drawn if absent.
+            mean: center of the first random candidates, ``[*batch, H, m]``. Defaults to the middle
+                of the bounds.
+
+        Returns:
+            Actions ``[*batch, H, m]``, in bounds, and score ``[*batch]``.
+        """
+        self._check_observation(tensordict)
+        batch = tensordict.batch_size
+        low = self._action_low
+        shape = self.settings.noise_shape(tuple(batch), low.numel())
+        if noise is None:
+            noise = torch.randn(shape, generator=self.generator, dtype=low.dtype, device=low.device)
+        elif noise.shape != shape:
+            raise ValueError(f"noise: expected shape {list(shape)}, got {list(noise.shape)}.")
+        if self._planning_function is None:
+            self._planning_function = self._build()
+        if self.uses_tensors:
+            observation = tensordict.get(self.observation_key)
+        else:
+            observation = tensordict.select(*self.in_keys)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return self._planning_function(observation, noise, mean)
+
+    def _check_observation(self, tensordict: TensorDictBase) -> None:
+        batch, device = tensordict.batch_size, self._action_low.device
+        for key, spec in self._checked.items():
+            value = tensordict.get(key, None)
+            shape = torch.Size([*batch, *spec.shape])
+            if value is None:
+                raise ValueError(f"{key}: expected a tensor of shape {list(shape)}, got none.")
+            if value.shape != shape or value.dtype != spec.dtype or value.device != device:
+                raise ValueError(
+                    f"{key}: expected {spec.dtype} of shape {list(shape)} on {device}, "
+                    f"got {value.dtype} of shape {list(value.shape)} on {value.device}."
+                )
+            # Elsewhere this would wait for the device; the plan falls back to the actor's action.
+            if device.type == "cpu" and not value.isfinite().all():
+                raise ValueError(f"{key}: expected finite observations, got some that are not.")
+
+
+def _action_spec(env: EnvBase, key: NestedKey) -> TensorSpec:
+    keys = [unravel_key(k) for k in env.action_keys]
+    if keys != [key]:
+        raise ValueError(f"action_key: expected the only action of {keys}, got {key!r}.")
+    spec = env.full_action_spec_unbatched[key]
+    if not spec.dtype.is_floating_point:
+        raise ValueError(f"env: expected continuous actions, got {spec.dtype}.")
+    return spec
+
+
+def _limits(spec: TensorSpec) -> tuple[Tensor, Tensor]:
+    """Bounds ``[m]`` of an action, infinite where there are none."""
+    shape, device = spec.shape, spec.device
+    if isinstance(spec, Bounded):
+        low, high = spec.space.low.expand(shape), spec.space.high.expand(shape)
+    else:
+        low, high = torch.full(shape, -torch.inf), torch.full(shape, torch.inf)
+    return tuple(t.to(dtype=spec.dtype, device=device).reshape(-1).clone() for t in (low, high))
+
+
+def _check_reward(env: EnvBase, key: NestedKey) -> None:
+    keys = [unravel_key(("next", k)) for k in env.reward_keys]
+    if key not in keys:
+        raise ValueError(f"reward_key: expected one of {keys}, got {key!r}.")
+    shape = env.full_reward_spec_unbatched[unravel_key(key[1:])].shape
+    if shape.numel() != 1:
+        raise ValueError(f"reward_key: expected one reward a step, got {key!r} of {list(shape)}.")
+
+
+def _done_keys(env: EnvBase, keys: NestedKey | Sequence[NestedKey] | None) -> list[NestedKey]:
+    known = [unravel_key(("next", k)) for k in env.done_keys]
+    if keys is None:
+        ends = [key for key in known if key[-1] == "terminated"]
+        return ends or [key for key in known if key[-1] == "done"]
+    if isinstance(keys, str) or (isinstance(keys, tuple) and tuple(keys) in known):
+        keys = [keys]
+    keys = [unravel_key(key) for key in keys]
+    if unknown := [key for key in keys if key not in known]:
+        raise ValueError(f"done_keys: expected some of {known}, got {unknown}.")
+    return keys
+
+
+def _observation_key(env: EnvBase, key: NestedKey | None) -> NestedKey | None:
+    keys = [unravel_key(k) for k in env.observation_spec.keys(True, True)]
+    if key is not None:
+        if unravel_key(key) not in keys:
+            raise ValueError(f"observation_key: expected one of {keys}, got {key!r}.")
+        return unravel_key(key)
+    if "observation" in keys:
+        return "observation"
+    return keys[0] if len(keys) == 1 else None
+
+
+def _specs(env: EnvBase, keys: Sequence[NestedKey]) -> dict[NestedKey, TensorSpec]:
+    specs = env.full_observation_spec_unbatched
+    return {key: specs[key] for key in keys}
