@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.dynamics.fitting import FitConfig, FitReport, fit
 from phihp_torchrl.dynamics.hybrid import HybridDynamics
+from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.dynamics.prior import PhysicsPrior, WorldPhysics, perturbed_constants
 from phihp_torchrl.dynamics.residual import ResidualMLP
 from phihp_torchrl.dynamics.world_model import TaskWorldModel
 
 __all__ = [
+    "DynamicsLoss",
+    "FitConfig",
+    "FitReport",
     "HybridDynamics",
     "PhysicsPrior",
     "ResidualMLP",
     "TaskWorldModel",
     "WorldPhysics",
+    "fit",
     "perturbed_constants",
 ]

@@ -1,0 +1,41 @@
+"""Actor and critics, and how TD3 trains them in imagination."""
+
+from __future__ import annotations
+
+from phihp_torchrl.agents.functional import Batch
+from phihp_torchrl.agents.imagination import (
+    ChunkNoise,
+    Worlds,
+    draw_noise,
+    imagine,
+    imagined_return,
+)
+from phihp_torchrl.agents.networks import (
+    Actor,
+    QNetwork,
+    TwinQ,
+    make_actor,
+    make_qvalue,
+    make_twin_qvalue,
+)
+from phihp_torchrl.agents.replay import FlatReplay
+from phihp_torchrl.agents.td3 import TD3Config, TD3Update, make_td3_loss
+
+__all__ = [
+    "Actor",
+    "Batch",
+    "ChunkNoise",
+    "FlatReplay",
+    "QNetwork",
+    "TD3Config",
+    "TD3Update",
+    "TwinQ",
+    "Worlds",
+    "draw_noise",
+    "imagine",
+    "imagined_return",
+    "make_actor",
+    "make_qvalue",
+    "make_td3_loss",
+    "make_twin_qvalue",
+]

@@ -1,0 +1,149 @@
+"""TD3's equations as pure functions on tensors (Fujimoto et al., 2018, arXiv:1802.09477).
+
+Everything here compiles into one graph. Networks are flat sequences of tensors ``(weight, bias, weight,
+bias, …)``; those of the critics carry a leading dimension, one entry a critic, as
+:class:`torchrl.objectives.TD3Loss` stacks them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+Layers = Sequence[Tensor]
+Transition = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+"""``state, action -> next_state, reward, terminated`` (see ``TaskWorldModel.transition``)."""
+
+
+class Batch(NamedTuple):
+    """Transitions, one a row."""
+
+    state: Tensor
+    """``[N, n]``."""
+    action: Tensor
+    """Physical units, ``[N, m]``."""
+    reward: Tensor
+    """``[N]``."""
+    next_state: Tensor
+    """``[N, n]``."""
+    terminated: Tensor
+    """bool ``[N]``."""
+
+
+def policy(actor: Layers, observation: Tensor, action_high: Tensor) -> Tensor:
+    """The actor: ``[N, o] -> [N, m]``, physical units."""
+    hidden = observation
+    for i in range(0, len(actor) - 2, 2):
+        hidden = F.linear(hidden, actor[i], actor[i + 1]).relu()
+    return F.linear(hidden, actor[-2], actor[-1]).tanh() * action_high
+
+
+def q_values(critics: Layers, observation: Tensor, action: Tensor, action_high: Tensor) -> Tensor:
+    """All critics at once: ``[N, o], [N, m] -> [critics, N]``."""
+    inputs = torch.cat([observation, action / action_high], -1)
+    hidden = inputs.expand(critics[0].shape[0], *inputs.shape)
+    for i in range(0, len(critics) - 2, 2):
+        weight, bias = critics[i], critics[i + 1]
+        hidden = torch.baddbmm(bias.unsqueeze(1), hidden, weight.mT).relu()
+    return torch.baddbmm(critics[-1].unsqueeze(1), hidden, critics[-2].mT).squeeze(-1)
+
+
+def td3_target(
+    batch: Batch,
+    actor: Layers,
+    critics: Layers,
+    noise: Tensor,
+    action_high: Tensor,
+    gamma: float,
+    observe: Callable[[Tensor], Tensor],
+    transition: Transition | None = None,
+    expansion: int = 1,
+) -> Tensor:
+    r"""The value that the critics should have, ``[N]``.
+
+    .. math::
+        y = \sum_{i<k} \gamma^i r_i + \gamma^k \min_j Q'_j(s_k, \mathrm{clip}(\pi'(s_k) + \epsilon))
+
+    with nothing after a termination. The first reward is the batch's; with ``expansion`` k > 1 the model
+    carries on for k - 1 steps under the target policy (model-based value expansion, Feinberg et al.,
+    2018, arXiv:1803.00101).
+
+    Args:
+        batch: transitions.
+        actor: target actor.
+        critics: target critics.
+        noise: target policy noise, clipped, in physical units, ``[N, m]``.
+        action_high: action bounds ``[m]``.
+        gamma: discount.
+        observe: state -> observation.
+        transition: the model, needed for ``expansion`` > 1.
+        expansion: number of rewards in the sum, k.
+    """
+    value = batch.reward
+    state = batch.next_state
+    alive = 1.0 - batch.terminated.to(value.dtype)
+    discount = gamma * alive
+    for _ in range(expansion - 1):
+        state, reward, terminated = transition(state, policy(actor, observe(state), action_high))
+        value = value + discount * reward
+        discount = gamma * discount * (1.0 - terminated.to(value.dtype))
+    observation = observe(state)
+    action = policy(actor, observation, action_high) + noise
+    action = torch.minimum(torch.maximum(action, -action_high), action_high)
+    return value + discount * q_values(critics, observation, action, action_high).amin(0)
+
+
+def critic_loss(
+    critics: Layers, observation: Tensor, action: Tensor, target: Tensor, action_high: Tensor
+) -> Tensor:
+    """Squared errors of all critics, summed over critics and averaged over the batch."""
+    error = q_values(critics, observation, action, action_high) - target
+    return error.square().sum(0).mean()
+
+
+def actor_loss(actor: Layers, critics: Layers, observation: Tensor, action_high: Tensor) -> Tensor:
+    """-Q1(s, pi(s)), averaged over the batch."""
+    action = policy(actor, observation, action_high)
+    first = [layer[:1] for layer in critics]
+    return -q_values(first, observation, action, action_high).mean()
+
+
+def adam_(
+    params: Layers,
+    grads: Layers,
+    means: Layers,
+    squares: Layers,
+    step: Tensor,
+    learning_rate: Tensor,
+    betas: tuple[float, float] = (0.9, 0.999),
+    eps: float = 1e-8,
+) -> None:
+    """One step of Adam in place, as :class:`torch.optim.Adam` defines it.
+
+    Args:
+        params: what to change.
+        grads: gradients.
+        means: first moments, changed in place.
+        squares: second moments, changed in place.
+        step: number of this step, from 1, scalar.
+        learning_rate: scalar.
+        betas: decay of the moments.
+        eps: added to the denominator.
+    """
+    beta1, beta2 = betas
+    size = learning_rate / (1.0 - beta1**step)
+    root = (1.0 - beta2**step).sqrt()
+    for param, grad, mean, square in zip(params, grads, means, squares, strict=True):
+        mean.lerp_(grad, 1.0 - beta1)
+        square.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)
+        param.sub_(size * mean / (square.sqrt() / root + eps))
+
+
+def soft_update_(targets: Layers, sources: Layers, tau: float) -> None:
+    """targets ← (1 - tau) targets + tau sources, in place."""
+    for target, source in zip(targets, sources, strict=True):
+        target.lerp_(source, tau)

@@ -1,0 +1,118 @@
+"""Imagined transitions in chunks: many worlds at once, a few steps at a time, as one graph."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.agents.functional import Batch, Layers, policy
+from phihp_torchrl.dynamics import TaskWorldModel
+
+
+class Worlds(NamedTuple):
+    """Where the imagined worlds are."""
+
+    state: Tensor
+    """``[worlds, n]``."""
+    age: Tensor
+    """Steps since the last reset, int64 ``[worlds]``."""
+
+
+class ChunkNoise(NamedTuple):
+    """All randomness of a chunk, drawn outside the graph so that seeds reproduce."""
+
+    start_states: Tensor
+    """Where a world goes on that ended at that step, ``[steps, worlds, n]``."""
+    exploration: Tensor
+    """Added to the policy's action, in units of the action bounds, ``[steps, worlds, m]``."""
+    random_actions: Tensor
+    """Uniform actions in physical units, ``[steps, worlds, m]``."""
+    use_random: Tensor
+    """Which actions are the random ones, bool ``[steps, worlds]``."""
+
+
+def draw_noise(
+    start_states: Tensor,
+    action_high: Tensor,
+    *,
+    std: float,
+    random_fraction: float,
+    generator: torch.Generator | None = None,
+) -> ChunkNoise:
+    """Draw the noise of a chunk of ``start_states`` ``[steps, worlds, n]``.
+
+    Args:
+        start_states: reset states, one a step and world.
+        action_high: action bounds ``[m]``.
+        std: exploration noise, in units of the action bounds.
+        random_fraction: share of uniformly random actions, in [0, 1].
+        generator: source of randomness.
+    """
+    shape = start_states.shape[:-1]
+    options = {"generator": generator, "device": start_states.device}
+    exploration = std * torch.randn([*shape, action_high.shape[0]], **options)
+    uniform = 2.0 * torch.rand([*shape, action_high.shape[0]], **options) - 1.0
+    use_random = torch.rand(shape, **options) < random_fraction
+    return ChunkNoise(start_states, exploration, uniform * action_high, use_random)
+
+
+def imagine(
+    world_model: TaskWorldModel,
+    actor: Layers,
+    worlds: Worlds,
+    noise: ChunkNoise,
+    action_high: Tensor,
+    max_age: int,
+) -> tuple[Batch, Worlds]:
+    """Step all worlds through a chunk under the noisy policy.
+
+    A world that terminates, leaves the finite numbers or reaches ``max_age`` steps goes on from a new
+    start state. Reaching ``max_age`` is truncation: it is not recorded as ``terminated``. A transition
+    into non-finite numbers is recorded as staying put with termination, and harms nothing.
+
+    Args:
+        world_model: the model.
+        actor: layers of the actor.
+        worlds: where the worlds are.
+        noise: randomness of the chunk.
+        action_high: action bounds ``[m]``.
+        max_age: steps a world lives at most.
+
+    Returns:
+        Transitions, ``[steps * worlds]`` rows, and where the worlds are now.
+    """
+    state, age = worlds
+    rows: list[Batch] = []
+    for t in range(noise.use_random.shape[0]):
+        action = policy(actor, world_model.observe(state), action_high)
+        action = action + noise.exploration[t] * action_high
+        action = torch.minimum(torch.maximum(action, -action_high), action_high)
+        action = torch.where(noise.use_random[t].unsqueeze(-1), noise.random_actions[t], action)
+        next_state, reward, terminated = world_model.transition(state, action)
+        finite = next_state.isfinite().all(-1) & reward.isfinite()
+        next_state = torch.where(finite.unsqueeze(-1), next_state, state)
+        reward = torch.where(finite, reward, torch.zeros_like(reward))
+        terminated = terminated | ~finite
+        rows.append(Batch(state, action, reward, next_state, terminated))
+        age = age + 1
+        ended = terminated | (age >= max_age)
+        state = torch.where(ended.unsqueeze(-1), noise.start_states[t], next_state)
+        age = torch.where(ended, torch.zeros_like(age), age)
+    batch = Batch(*(torch.cat(column) for column in zip(*rows, strict=True)))
+    return batch, Worlds(state, age)
+
+
+def imagined_return(
+    world_model: TaskWorldModel, actor: Layers, state: Tensor, action_high: Tensor, steps: int
+) -> Tensor:
+    """Undiscounted return of the noise-free policy from each state ``[N, n]``, ``[N]``."""
+    total = torch.zeros_like(state[..., 0])
+    alive = torch.ones_like(total)
+    for _ in range(steps):
+        action = policy(actor, world_model.observe(state), action_high)
+        state, reward, terminated = world_model.transition(state, action)
+        total = total + alive * reward
+        alive = alive * (1.0 - terminated.to(alive.dtype))
+    return total

@@ -1,0 +1,231 @@
+"""TD3 as one fused step on the tensors of TorchRL's TD3Loss."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import TD3Loss, ValueEstimators
+
+from phihp_torchrl.agents.functional import (
+    Batch,
+    actor_loss,
+    adam_,
+    critic_loss,
+    soft_update_,
+    td3_target,
+)
+from phihp_torchrl.agents.networks import make_actor, make_qvalue
+from phihp_torchrl.dynamics import TaskWorldModel
+
+
+@dataclass(frozen=True)
+class TD3Config:
+    """Hyper-parameters of TD3 (SPEC section 3); the values are the published ones.
+
+    Noise is in units of the action bounds.
+    """
+
+    actor_hidden_sizes: tuple[int, ...] = (300, 300)
+    critic_hidden_sizes: tuple[int, ...] = (200, 200, 200)
+    actor_learning_rate: float = 1e-3
+    critic_learning_rate: float = 1e-4
+    last_layer_scale: float = 1.0
+    gamma: float = 0.99
+    tau: float = 0.005
+    policy_delay: int = 2
+    target_noise: float = 0.1
+    target_noise_clip: float = 0.5
+    value_expansion: int = 1
+
+    def __post_init__(self) -> None:
+        positive = ("actor_learning_rate", "critic_learning_rate", "policy_delay", "value_expansion")
+        for name in positive:
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        for name in ("gamma", "tau"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name}: expected a number in (0, 1], got {getattr(self, name)}.")
+        for name in ("target_noise", "target_noise_clip", "last_layer_scale"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
+
+
+def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
+    """TorchRL's TD3Loss with the published networks and noise, for the world model's task."""
+    task = world_model.task
+    high = torch.tensor(task.action_high)
+    loss = TD3Loss(
+        make_actor(task, config.actor_hidden_sizes, config.last_layer_scale),
+        make_qvalue(task, config.critic_hidden_sizes),
+        bounds=(-high, high),
+        num_qvalue_nets=2,
+        loss_function="l2",
+        policy_noise=config.target_noise * high,
+        noise_clip=config.target_noise_clip * high,
+    )
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
+    return loss
+
+
+class TD3Update(nn.Module):
+    """``policy_delay`` critic updates, one actor update and the soft updates, as one graph.
+
+    The tensors it changes are those of a :class:`~torchrl.objectives.TD3Loss`, which stays the owner of
+    parameters and targets: checkpoints, planners and stock TorchRL code read them there. The moments of
+    Adam are buffers of this module.
+
+    Args:
+        loss: whose parameters to train.
+        world_model: maps states to observations and carries value expansion.
+        config: hyper-parameters.
+        compile: whether to compile the step (10 to 40 s at first, from the cache afterwards).
+
+    Examples:
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> from phihp_torchrl.dynamics import TaskWorldModel
+        >>> task = get_task("pendulum")
+        >>> model = TaskWorldModel(task, HybridDynamics.oracle(task))
+        >>> config = TD3Config()
+        >>> update = TD3Update(make_td3_loss(model, config), model, config)
+        >>> state = task.coverage.sample([64])
+        >>> action = torch.zeros(64, 1)
+        >>> next_state, reward, terminated = model.transition(state, action)
+        >>> batch = Batch(state, action, reward, next_state, terminated)
+        >>> sorted(update([batch] * config.policy_delay))
+        ['loss_actor', 'loss_qvalue']
+    """
+
+    def __init__(
+        self,
+        loss: TD3Loss,
+        world_model: TaskWorldModel,
+        config: TD3Config,
+        *,
+        compile: bool = False,
+    ) -> None:
+        super().__init__()
+        self.loss = loss
+        self.world_model = world_model
+        self.config = config
+        for name in ("actor", "critics"):
+            for i, layer in enumerate(getattr(self, name)):
+                self.register_buffer(f"{name}_mean_{i}", torch.zeros_like(layer))
+                self.register_buffer(f"{name}_square_{i}", torch.zeros_like(layer))
+        self.register_buffer("steps", torch.zeros((), dtype=torch.float64))
+        step = self._step
+        self._compiled_step = torch.compile(step, fullgraph=True) if compile else step
+
+    @property
+    def actor(self) -> list[Tensor]:
+        """The actor's layers, the loss's own tensors."""
+        return layers(self.loss.actor_network_params)
+
+    @property
+    def critics(self) -> list[Tensor]:
+        """The critics' stacked layers, the loss's own tensors."""
+        return layers(self.loss.qvalue_network_params)
+
+    def _moments(self, name: str) -> tuple[list[Tensor], list[Tensor]]:
+        count = len(getattr(self, name))
+        means = [getattr(self, f"{name}_mean_{i}") for i in range(count)]
+        return means, [getattr(self, f"{name}_square_{i}") for i in range(count)]
+
+    @torch.no_grad()
+    def forward(
+        self,
+        batches: Sequence[Batch],
+        learning_rate_scale: float = 1.0,
+        generator: torch.Generator | None = None,
+    ) -> dict[str, Tensor]:
+        """Train on ``policy_delay`` batches.
+
+        Args:
+            batches: one batch for each critic update; the actor learns from the last.
+            learning_rate_scale: factor on both learning rates.
+            generator: source of the target policy's noise.
+
+        Returns:
+            ``loss_qvalue`` and ``loss_actor``, detached scalars.
+        """
+        if len(batches) != self.config.policy_delay:
+            raise ValueError(
+                f"batches: expected policy_delay = {self.config.policy_delay}, got {len(batches)}."
+            )
+        high = self.loss.max_action
+        noises = []
+        for batch in batches:
+            noise = self.config.target_noise * torch.randn(
+                batch.action.shape, generator=generator, device=high.device
+            )
+            clip = self.config.target_noise_clip
+            noises.append(noise.clamp(-clip, clip) * high)
+        scale = torch.tensor(learning_rate_scale, dtype=torch.float32, device=high.device)
+        loss_qvalue, loss_actor = self._compiled_step(
+            tuple(batches),
+            tuple(noises),
+            scale,
+            self.steps,
+            self.actor,
+            self.critics,
+            layers(self.loss.target_actor_network_params),
+            layers(self.loss.target_qvalue_network_params),
+            self._moments("actor"),
+            self._moments("critics"),
+            high,
+        )
+        self.steps += 1
+        return {"loss_qvalue": loss_qvalue, "loss_actor": loss_actor}
+
+    def _step(
+        self,
+        batches: tuple[Batch, ...],
+        noises: tuple[Tensor, ...],
+        scale: Tensor,
+        steps: Tensor,
+        actor: list[Tensor],
+        critics: list[Tensor],
+        target_actor: list[Tensor],
+        target_critics: list[Tensor],
+        actor_moments: tuple[list[Tensor], list[Tensor]],
+        critic_moments: tuple[list[Tensor], list[Tensor]],
+        high: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        config, observe = self.config, self.world_model.observe
+        steps = steps.to(torch.float32)
+        for i, (batch, noise) in enumerate(zip(batches, noises, strict=True)):
+            target = td3_target(
+                batch,
+                target_actor,
+                target_critics,
+                noise,
+                high,
+                config.gamma,
+                observe,
+                self.world_model.transition,
+                config.value_expansion,
+            )
+            observation = observe(batch.state)
+            gradients, loss_qvalue = torch.func.grad_and_value(critic_loss)(
+                critics, observation, batch.action, target, high
+            )
+            rate = scale * config.critic_learning_rate
+            count = steps * config.policy_delay + (i + 1)
+            adam_(critics, gradients, *critic_moments, count, rate)
+        gradients, loss_actor = torch.func.grad_and_value(actor_loss)(
+            actor, critics, observation, high
+        )
+        adam_(actor, gradients, *actor_moments, steps + 1, scale * config.actor_learning_rate)
+        soft_update_(target_actor, actor, config.tau)
+        soft_update_(target_critics, critics, config.tau)
+        return loss_qvalue, loss_actor
+
+
+def layers(params: TensorDictBase) -> list[Tensor]:
+    """The weights and biases of TD3Loss parameters, detached but the same memory."""
+    mlp = params["module", "mlp"]
+    names = sorted(mlp.keys(), key=int)
+    return [mlp[name, part].detach() for name in names for part in ("weight", "bias")]

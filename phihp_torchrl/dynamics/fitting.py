@@ -1,0 +1,235 @@
+"""Fitting the model to transitions: by Adam, as published, or by Levenberg-Marquardt."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.func import functional_call, jacrev, vmap
+
+from phihp_torchrl.dynamics.loss import DynamicsLoss
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How to fit the model.
+
+    Args:
+        method: ``"levenberg_marquardt"`` or ``"adam"``. The model is small and its loss a sum of squares,
+            so a second-order method reaches errors in seconds that Adam does not reach at all.
+        steps: steps of the method.
+        scaled: whether errors are measured in units of one-step changes
+            (:meth:`DynamicsLoss.set_scales`), or in raw units as published.
+        batch_size: transitions per step; ``None`` for all of them, as published.
+        learning_rate: of Adam.
+        cosine_decay: whether Adam's learning rate decays to zero.
+        initial_lambda: where Levenberg-Marquardt's lambda starts. A small one makes the prior explain
+            what it can before the residual may take part.
+        final_lambda: where it ends.
+        patience: Levenberg-Marquardt stops after this many steps, at its final lambda, that did not
+            improve the held-out error by a tenth.
+    """
+
+    method: str = "levenberg_marquardt"
+    steps: int = 60
+    scaled: bool = True
+    batch_size: int | None = 1000
+    learning_rate: float = 1e-3
+    cosine_decay: bool = False
+    initial_lambda: float = 1e-2
+    final_lambda: float = 1e7
+    patience: int = 8
+
+    def __post_init__(self) -> None:
+        if self.method not in ("levenberg_marquardt", "adam"):
+            raise ValueError(
+                f"method: expected 'levenberg_marquardt' or 'adam', got {self.method!r}."
+            )
+        for name in ("steps", "patience", "learning_rate", "initial_lambda", "final_lambda"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        if self.batch_size is not None and self.batch_size < 1:
+            raise ValueError(f"batch_size: expected a positive number, got {self.batch_size}.")
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """How a fit went. Errors are mean ‖(s' - ŝ') / scale‖² over transitions."""
+
+    train_error: float
+    held_out_error: float
+    steps: int
+    seconds: float
+
+
+def fit(
+    loss: DynamicsLoss,
+    train: TensorDictBase,
+    held_out: TensorDictBase,
+    config: FitConfig,
+    generator: torch.Generator | None = None,
+) -> FitReport:
+    """Fit ``loss.dynamics`` to transitions, in place, from where it is.
+
+    Args:
+        loss: the model's loss; its lambda and scales are changed too.
+        train: transitions ``[N]`` to learn from.
+        held_out: transitions ``[M]`` that only measure; the best parameters on them are kept by
+            Levenberg-Marquardt.
+        config: how.
+        generator: source of mini-batches.
+
+    Raises:
+        ValueError: if there are no transitions, or some are not finite.
+    """
+    for name, data in (("train", train), ("held_out", held_out)):
+        if data.numel() == 0:
+            raise ValueError(f"{name}: expected at least one transition, got none.")
+        if not all(part.isfinite().all() for part in loss.transitions(data)):
+            raise ValueError(f"{name}: expected finite transitions, got some that are not.")
+    start = time.perf_counter()
+    if config.scaled:
+        loss.set_scales(train)
+    method = _adam if config.method == "adam" else _levenberg_marquardt
+    steps = method(loss, train, held_out, config, generator)
+    return FitReport(
+        train_error=_error(loss, train),
+        held_out_error=_error(loss, held_out),
+        steps=steps,
+        seconds=time.perf_counter() - start,
+    )
+
+
+@torch.no_grad()
+def _error(loss: DynamicsLoss, data: TensorDictBase) -> float:
+    return loss(data)["loss_prediction"].item()
+
+
+def _adam(
+    loss: DynamicsLoss,
+    train: TensorDictBase,
+    held_out: TensorDictBase,
+    config: FitConfig,
+    generator: torch.Generator | None,
+) -> int:
+    optimizer = torch.optim.Adam(loss.dynamics.parameters(), lr=config.learning_rate, fused=True)
+    for step in range(config.steps):
+        if config.cosine_decay:
+            decay = 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
+            optimizer.param_groups[0]["lr"] = config.learning_rate * decay
+        batch = train
+        if config.batch_size is not None and config.batch_size < len(train):
+            batch = train[torch.randint(len(train), (config.batch_size,), generator=generator)]
+        losses = loss(batch)
+        (losses["loss_prediction"] + losses["loss_residual"]).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        loss.update_lambda(losses["loss_prediction"].detach())
+    return config.steps
+
+
+@torch.no_grad()
+def _levenberg_marquardt(
+    loss: DynamicsLoss,
+    train: TensorDictBase,
+    held_out: TensorDictBase,
+    config: FitConfig,
+    generator: torch.Generator | None,
+) -> int:
+    r"""Minimise mean ‖error‖² + (1/lambda) mean ‖F^r‖² by damped Gauss-Newton steps.
+
+    .. math:: (J^\top J + \mu\,\mathrm{diag}\,J^\top J)\,\delta = -J^\top r
+
+    The penalty is squared here, where the paper's is a norm, because the method needs squares.
+    """
+    system = _LeastSquares(loss)
+    data = loss.transitions(train)
+    reference = loss.transitions(held_out)
+    theta = system.parameters()
+    damping = 1e-2
+    growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
+    loss.lambda_.fill_(config.initial_lambda)
+    best, best_error, stale, step = theta, math.inf, 0, 0
+    for step in range(1, config.steps + 1):
+        rows = data
+        if config.batch_size is not None and config.batch_size < len(train):
+            index = torch.randint(len(train), (config.batch_size,), generator=generator)
+            rows = tuple(part[index] for part in data)
+        theta, damping, improved = system.step(theta, rows, damping)
+        error = system.prediction_error(theta, reference)
+        stale = 0 if error < 0.9 * best_error else stale + 1
+        if error < best_error:
+            best, best_error = theta, error
+        final = loss.lambda_.item() >= config.final_lambda
+        if final and (stale >= config.patience or not improved):
+            break
+        loss.lambda_.mul_(growth).clamp_(max=config.final_lambda)
+    system.write(best)
+    return step
+
+
+class _LeastSquares:
+    """The loss as rows to be squared, and its Jacobian, over one flat vector of parameters."""
+
+    def __init__(self, loss: DynamicsLoss) -> None:
+        self.loss = loss
+        self.named = dict(loss.named_parameters())
+        self.sizes = [p.numel() for p in self.named.values()]
+        self._rows = vmap(self._row, (None, 0, 0, 0))
+        self._jacobian = vmap(jacrev(self._row), (None, 0, 0, 0))
+
+    def parameters(self) -> Tensor:
+        return torch.cat([p.detach().reshape(-1) for p in self.named.values()])
+
+    def write(self, theta: Tensor) -> None:
+        for name, value in self._unpack(theta).items():
+            self.named[name].copy_(value)
+
+    def _unpack(self, theta: Tensor) -> dict[str, Tensor]:
+        parts = zip(self.named.items(), theta.split(self.sizes), strict=True)
+        return {name: part.reshape(p.shape) for (name, p), part in parts}
+
+    def _row(self, theta: Tensor, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        error, residual = functional_call(
+            _Terms(self.loss),
+            {f"loss.{name}": value for name, value in self._unpack(theta).items()},
+            (state, action, next_state),
+        )
+        return torch.cat([error, residual / self.loss.lambda_.sqrt()])
+
+    def prediction_error(self, theta: Tensor, rows: tuple[Tensor, ...]) -> float:
+        n = rows[0].shape[-1]
+        return self._rows(theta, *rows)[:, :n].square().sum(-1).mean().item()
+
+    def step(
+        self, theta: Tensor, rows: tuple[Tensor, ...], damping: float
+    ) -> tuple[Tensor, float, bool]:
+        """One step downhill: new parameters, new damping, and whether any was found."""
+        values = self._rows(theta, *rows).reshape(-1)
+        jacobian = self._jacobian(theta, *rows).reshape(values.shape[0], -1)
+        normal = (jacobian.mT @ jacobian).double()
+        gradient = (jacobian.mT @ values).double()
+        diagonal = normal.diagonal().clamp_min(1e-9 * normal.diagonal().max())
+        cost = values.square().sum()
+        for _ in range(8):
+            delta, info = torch.linalg.solve_ex(normal + damping * diagonal.diag(), gradient)
+            candidate = theta - delta.to(theta.dtype)
+            if info == 0 and self._rows(candidate, *rows).square().sum() < cost:
+                return candidate, max(damping / 5.0, 1e-10), True
+            damping = min(damping * 4.0, 1e8)
+        return theta, damping, False
+
+
+class _Terms(torch.nn.Module):
+    """:meth:`DynamicsLoss.terms` as a forward pass."""
+
+    def __init__(self, loss: DynamicsLoss) -> None:
+        super().__init__()
+        self.loss = loss
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor) -> tuple[Tensor, Tensor]:
+        return self.loss.terms(state, action, next_state)

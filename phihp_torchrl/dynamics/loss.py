@@ -1,0 +1,146 @@
+"""What the model is fitted to: L_pred + (1/lambda) |F^r| (paper, section 4.1, equation 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from phihp_torchrl.dynamics.hybrid import HybridDynamics
+
+
+class DynamicsLoss(LossModule):
+    r"""The loss of the hybrid model.
+
+    .. math::
+        L_\lambda(\theta) = L_{pred} + \frac{1}{\lambda}\lVert F^r\rVert_2, \qquad
+        L_{pred} = \mathrm{mean}\,\lVert s' - \hat s'\rVert^2, \qquad
+        \lambda \leftarrow \lambda + \tau_{ph} L_{pred}
+
+    Angles are compared on the circle. :math:`\lVert F^r\rVert_2` is the mean over the batch of each
+    transition's norm, so that it does not grow with the batch. With :meth:`set_scales` errors and
+    residual are measured in units of the data's one-step changes, component by component, which
+    gives slow components a voice; without it they are in raw units, as published.
+
+    Args:
+        dynamics: the model to fit.
+        lambda_0: initial :math:`\lambda`.
+        tau_ph: growth of :math:`\lambda`.
+
+    Raises:
+        ValueError: if ``lambda_0`` is not positive or ``tau_ph`` is negative.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> task = get_task("pendulum")
+        >>> loss = DynamicsLoss(HybridDynamics.hybrid(task), lambda_0=1e3, tau_ph=1e3)
+        >>> observation = task.system.observe(task.reset.sample([8]))
+        >>> data = TensorDict(
+        ...     observation=observation,
+        ...     action=torch.zeros(8, 1),
+        ...     next=TensorDict(observation=observation, batch_size=[8]),
+        ...     batch_size=[8],
+        ... )
+        >>> sorted(loss(data).keys())
+        ['loss_prediction', 'loss_residual', 'residual_norm']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that can be set with ``set_keys``; observations are also read under ``"next"``."""
+
+        observation: NestedKey = "observation"
+        action: NestedKey = "action"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    out_keys = ["loss_prediction", "loss_residual", "residual_norm"]
+
+    dynamics: HybridDynamics
+    lambda_: Tensor
+    error_scale: Tensor
+    residual_scale: Tensor
+
+    def __init__(
+        self, dynamics: HybridDynamics, *, lambda_0: float = 1e3, tau_ph: float = 1e3
+    ) -> None:
+        super().__init__()
+        if not lambda_0 > 0:
+            raise ValueError(f"lambda_0: expected a positive number, got {lambda_0}.")
+        if not tau_ph >= 0:
+            raise ValueError(f"tau_ph: expected a number >= 0, got {tau_ph}.")
+        self.dynamics = dynamics
+        self.tau_ph = tau_ph
+        self.register_buffer("lambda_", torch.tensor(float(lambda_0)))
+        self.register_buffer("error_scale", torch.ones(dynamics.task.system.state_dim))
+        self.register_buffer("residual_scale", torch.ones(dynamics.task.system.state_dim))
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        return [keys.observation, keys.action, ("next", keys.observation)]
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:  # type: ignore[no-untyped-def]
+        """This loss has no value estimator."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Compute the loss of transitions with any batch shape.
+
+        Args:
+            tensordict: ``"observation"`` ``[*batch, o]``, ``"action"`` ``[*batch, m]``,
+                ``("next", "observation")`` ``[*batch, o]``.
+
+        Returns:
+            ``loss_prediction`` and ``loss_residual``, whose sum is to be minimised, and the detached
+            ``residual_norm``; scalars.
+        """
+        error, residual = self.terms(*self.transitions(tensordict))
+        loss_prediction = error.square().sum(-1).mean()
+        norm = torch.linalg.vector_norm(residual, dim=-1).mean()
+        return TensorDict(
+            loss_prediction=loss_prediction,
+            loss_residual=norm / self.lambda_,
+            residual_norm=norm.detach(),
+        )
+
+    def transitions(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """State, action and next state of a tensordict's transitions."""
+        locate, keys = self.dynamics.task.system.locate, self.tensor_keys
+        next_observation = tensordict.get("next").get(keys.observation)
+        state = locate(tensordict.get(keys.observation))
+        return state, tensordict.get(keys.action), locate(next_observation)
+
+    def terms(self, state: Tensor, action: Tensor, next_state: Tensor) -> tuple[Tensor, Tensor]:
+        """What the two losses measure, scaled: ``s' - ŝ'`` and F^r, each ``[*batch, n]``."""
+        error = self.prediction_error(state, action, next_state) / self.error_scale
+        if self.dynamics.residual is None:
+            return error, torch.zeros_like(error)
+        return error, self.dynamics.residual(state, action) / self.residual_scale
+
+    def prediction_error(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+        """``s' - ŝ'`` ``[*batch, n]``, angles on the circle."""
+        return self.dynamics.task.system.difference(next_state, self.dynamics(state, action))
+
+    @torch.no_grad()
+    def update_lambda(self, loss_prediction: Tensor) -> None:
+        """λ ← λ + τ_ph L_pred, once an epoch."""
+        self.lambda_.add_(self.tau_ph * loss_prediction)
+
+    @torch.no_grad()
+    def set_scales(self, tensordict: TensorDictBase) -> None:
+        """Measure errors in units of these transitions' one-step changes from now on.
+
+        The residual network's input and output scales are set from the same transitions.
+        """
+        state, action, next_state = self.transitions(tensordict.reshape(-1))
+        task = self.dynamics.task
+        rate = task.system.difference(next_state, state) / task.time_step
+        size = rate.std(0).clamp_min(1e-3)
+        self.error_scale.copy_(size * task.time_step)
+        self.residual_scale.copy_(size)
+        if hasattr(self.dynamics.residual, "set_scales"):
+            self.dynamics.residual.set_scales(state, action, rate)

@@ -1,0 +1,357 @@
+"""Phase 1: collect, fit, plan and collect (paper, section 4.1 and appendix C)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase, GymEnv
+
+from phihp_torchrl.dynamics import (
+    DynamicsLoss,
+    FitConfig,
+    HybridDynamics,
+    PhysicsPrior,
+    ResidualMLP,
+    TaskWorldModel,
+    fit,
+    perturbed_constants,
+)
+from phihp_torchrl.envs import WorldModelEnv
+from phihp_torchrl.planners import CEMPlanner
+from phihp_torchrl.tasks import Task
+
+_ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
+_BLOCK = 20
+"""Held-out data are whole blocks of this many steps, one in ten."""
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """How the model-based controller collects data.
+
+    Args:
+        planning_horizon: actions in a plan.
+        replan_every: steps of a plan to act before the next.
+        num_candidates: population of the search.
+        top_k: its elites.
+        optim_steps: its iterations.
+        noise: std of the noise on the first planned iteration's actions, in units of the action bounds.
+            It fades to zero with the last.
+        random_hold: steps for which a random action is held in the first iteration, so that slow
+            systems move.
+        exploration_reward: whether to plan for the task's exploration reward, where it has one.
+    """
+
+    planning_horizon: int = 30
+    replan_every: int = 15
+    num_candidates: int = 500
+    top_k: int = 20
+    optim_steps: int = 3
+    noise: float = 0.3
+    random_hold: int = 1
+    exploration_reward: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.noise >= 0:
+            raise ValueError(f"noise: expected a number >= 0, got {self.noise}.")
+        if self.random_hold < 1:
+            raise ValueError(f"random_hold: expected a positive number, got {self.random_hold}.")
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Phase 1.
+
+    Args:
+        real_steps: real transitions in all.
+        steps_per_iteration: real transitions between two fits, T.
+        kind: ``"hybrid"``, ``"data_driven"``, ``"prior"`` or ``"oracle"``.
+        constants_error: relative error of the prior's first guess, signs drawn by the seed.
+        hidden_sizes: widths of the residual's hidden layers.
+        activation: of the residual: ``"tanh"``, ``"silu"`` or ``"relu"``.
+        residual_outputs: ``"velocities"`` or ``"all"`` (see :meth:`HybridDynamics.hybrid`).
+        integrator: of the model.
+        lambda_0: initial weight λ of the published loss.
+        tau_ph: its growth.
+        warm_start: whether a fit starts from the one before.
+        fit: how to fit.
+        collect: how to collect.
+    """
+
+    real_steps: int = 5000
+    steps_per_iteration: int = 500
+    kind: str = "hybrid"
+    constants_error: float = 0.3
+    hidden_sizes: tuple[int, ...] = (16, 16)
+    activation: str = "tanh"
+    residual_outputs: str = "velocities"
+    integrator: str = "semi_implicit_euler"
+    lambda_0: float = 1e3
+    tau_ph: float = 1e3
+    warm_start: bool = True
+    fit: FitConfig = field(default_factory=FitConfig)
+    collect: CollectConfig = field(default_factory=CollectConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("real_steps", "steps_per_iteration"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        if self.kind not in ("hybrid", "data_driven", "prior", "oracle"):
+            raise ValueError(
+                f"kind: expected 'hybrid', 'data_driven', 'prior' or 'oracle', got {self.kind!r}."
+            )
+        if self.activation not in _ACTIVATIONS:
+            raise ValueError(
+                f"activation: expected one of {sorted(_ACTIVATIONS)}, got {self.activation!r}."
+            )
+
+
+def make_dynamics(
+    task: Task, config: ModelConfig, generator: torch.Generator | None = None
+) -> HybridDynamics:
+    """The model of ``config``, untrained.
+
+    Args:
+        task: the task.
+        config: phase 1.
+        generator: source of the signs of the first guess's errors. The networks' initial weights come
+            from torch's global generator.
+    """
+    if config.kind == "oracle":
+        return HybridDynamics.oracle(task)
+    prior = residual = None
+    if config.kind != "data_driven":
+        guess = perturbed_constants(task.system, config.constants_error, generator)
+        prior = PhysicsPrior(task.system, guess)
+    if config.kind != "prior":
+        outputs = None
+        if prior is not None and config.residual_outputs == "velocities":
+            outputs = task.system.velocity_indices or None
+        activation = _ACTIVATIONS[config.activation]
+        residual = ResidualMLP(task.system, config.hidden_sizes, outputs, activation)
+    return HybridDynamics(task, prior=prior, residual=residual, integrator=config.integrator)
+
+
+class ModelTrainer:
+    """Learns the model from real steps: random steps, fit, planned steps, fit, …
+
+    Args:
+        task: the task.
+        config: phase 1.
+        env: the real world, with batch size ``[]``. Defaults to the task's gymnasium world.
+        seed: of everything random here.
+
+    Raises:
+        ValueError: if the environment lacks ``"observation"`` or ``"action"``.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> config = ModelConfig(real_steps=100, steps_per_iteration=50, fit=FitConfig(steps=5))
+        >>> trainer = ModelTrainer(get_task("pendulum"), config, seed=0)
+        >>> while not trainer.done:
+        ...     metrics = trainer.advance()
+        >>> trainer.real_steps
+        100
+    """
+
+    def __init__(
+        self, task: Task, config: ModelConfig, *, seed: int, env: EnvBase | None = None
+    ) -> None:
+        self.task = task
+        self.config = config
+        self.env = make_real_env(task) if env is None else env
+        for key in ("observation", "action"):
+            if key not in (*self.env.observation_spec.keys(), *self.env.full_action_spec.keys()):
+                raise ValueError(f"env: expected an environment with {key!r}, got {self.env}.")
+        self.generator = torch.Generator().manual_seed(seed)
+        self.dynamics = make_dynamics(task, config, self.generator)
+        self._initial = {k: v.clone() for k, v in self.dynamics.state_dict().items()}
+        self.loss = DynamicsLoss(self.dynamics, lambda_0=config.lambda_0, tau_ph=config.tau_ph)
+        self.data: TensorDict | None = None
+        self.iteration = 0
+        self.env.set_seed(self._draw_seed())
+
+    @property
+    def real_steps(self) -> int:
+        """Real transitions so far."""
+        return 0 if self.data is None else len(self.data)
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Real transitions so far and in all."""
+        return self.real_steps, self.config.real_steps
+
+    @property
+    def done(self) -> bool:
+        """Whether all real transitions are collected and fitted."""
+        return self.real_steps >= self.config.real_steps
+
+    def states(self) -> Tensor:
+        """All states seen, ``[N, n]``."""
+        return self.loss.transitions(self.data)[0]
+
+    def advance(self) -> dict[str, float]:
+        """Collect once and fit once; returns what to log."""
+        steps = min(self.config.steps_per_iteration, self.config.real_steps - self.real_steps)
+        new = self.collect(steps)
+        self.data = new if self.data is None else torch.cat([self.data, new])
+        self.iteration += 1
+        metrics = {"real_steps": self.real_steps, "collect/reward": new["next", "reward"].mean()}
+        if self.config.kind != "oracle":
+            metrics |= self.fit()
+        return {name: float(value) for name, value in metrics.items()}
+
+    def collect(self, steps: int) -> TensorDict:
+        """Take real steps: at random in the first iteration, with the planner in later ones."""
+        policy = self._random_policy() if self.iteration == 0 else self._planning_policy()
+        # A seed of its own for every iteration: a resumed run sees the same resets.
+        self.env.set_seed(self._draw_seed())
+        with torch.no_grad():
+            rollout = self.env.rollout(steps, policy, break_when_any_done=False)
+        return TensorDict(
+            observation=rollout["observation"].float(),
+            action=rollout["action"].float(),
+            next=TensorDict(
+                observation=rollout["next", "observation"].float(),
+                reward=rollout["next", "reward"].float(),
+                done=rollout["next", "done"],
+                batch_size=[steps],
+            ),
+            batch_size=[steps],
+        ).detach()
+
+    def fit(self) -> dict[str, Tensor | float]:
+        """Fit the model to all data and measure it."""
+        if not self.config.warm_start:
+            self.dynamics.load_state_dict(self._initial)
+            self.loss.lambda_.fill_(self.config.lambda_0)
+        train, held_out, blocks = split(self.data)
+        report = fit(self.loss, train, held_out, self.config.fit, self.generator)
+        state, action, _ = self.loss.transitions(train)
+        metrics: dict[str, Tensor | float] = {
+            "model/train_error": report.train_error,
+            "model/held_out_error": report.held_out_error,
+            "model/fit_steps": report.steps,
+            "model/fit_seconds": report.seconds,
+            "model/lambda": self.loss.lambda_,
+            "model/residual_share": self.dynamics.residual_share(state, action),
+        }
+        if blocks is not None:
+            metrics[f"model/rollout_error_{_BLOCK}"] = rollout_error(self.loss, blocks)
+        if isinstance(self.dynamics.prior, PhysicsPrior):
+            constants = self.dynamics.prior.constants()
+            for name, value in self.task.system.identifiable(constants).items():
+                metrics[f"constants/{name}"] = value.detach()
+        return metrics
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a resumed run needs, tensors and numbers only."""
+        return {
+            "dynamics": self.dynamics.state_dict(),
+            "initial": self._initial,
+            "loss": {
+                name: buffer for name, buffer in self.loss.named_buffers(recurse=False)
+            },
+            "data": None if self.data is None else self.data.to_dict(),
+            "iteration": self.iteration,
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from :meth:`state_dict`."""
+        self.dynamics.load_state_dict(state["dynamics"])
+        self._initial = dict(state["initial"])
+        for name, value in state["loss"].items():
+            self.loss.get_buffer(name).copy_(value)
+        data = state["data"]
+        self.data = None if data is None else TensorDict(data).auto_batch_size_(1)
+        self.iteration = state["iteration"]
+        self.generator.set_state(state["generator"])
+
+    def _draw_seed(self) -> int:
+        return int(torch.randint(2**31, (), generator=self.generator))
+
+    def _random_policy(self) -> Any:
+        high = torch.tensor(self.task.action_high)
+        hold, count, action = self.config.collect.random_hold, 0, None
+
+        def policy(tensordict: TensorDictBase) -> TensorDictBase:
+            nonlocal count, action
+            if count % hold == 0:
+                action = high * (2.0 * torch.rand(high.shape, generator=self.generator) - 1.0)
+            count += 1
+            return tensordict.set("action", action.clone())
+
+        return policy
+
+    def _planning_policy(self) -> Any:
+        config, task = self.config.collect, self.task
+        if config.exploration_reward and task.exploration_reward is not None:
+            task = replace(task, reward=task.exploration_reward)
+        planner = CEMPlanner(
+            WorldModelEnv(TaskWorldModel(task, self.dynamics), seed=0),
+            planning_horizon=config.planning_horizon,
+            optim_steps=config.optim_steps,
+            num_candidates=config.num_candidates,
+            top_k=config.top_k,
+            gamma=1.0,
+            replan_every=config.replan_every,
+            generator=self.generator,
+        )
+        high = torch.tensor(task.action_high)
+        iterations = -(-self.config.real_steps // self.config.steps_per_iteration)
+        fade = max(0.0, 1.0 - (self.iteration - 1) / max(1, iterations - 2))
+
+        def policy(tensordict: TensorDictBase) -> TensorDictBase:
+            if tensordict["step_count"].item() == 0:
+                planner.reset()
+            observed = TensorDict(observation=tensordict["observation"].float())
+            noise = torch.randn(high.shape, generator=self.generator)
+            action = planner(observed)["action"] + fade * config.noise * high * noise
+            return tensordict.set("action", task.clip_action(action))
+
+        return policy
+
+
+def make_real_env(task: Task) -> EnvBase:
+    """The task's gymnasium world as a TorchRL environment that counts and limits its steps."""
+    import gymnasium
+
+    from torchrl.envs import GymWrapper, StepCounter, TransformedEnv
+
+    world = gymnasium.make("phihp/Task-v0", task=task)
+    return TransformedEnv(GymWrapper(world), StepCounter())
+
+
+def split(data: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase, TensorDictBase | None]:
+    """Hold out every tenth block of consecutive steps.
+
+    Args:
+        data: transitions ``[N]`` in the order they happened.
+
+    Returns:
+        Transitions to learn from, held-out transitions, and those held-out blocks in which no episode
+        ended, ``[blocks, steps]``, or ``None`` if there are none.
+    """
+    index = torch.arange(len(data))
+    held = (index // _BLOCK) % 10 == 9
+    if not held.any():  # too few for a block
+        held = index % 10 == 9 if len(data) >= 10 else index == len(data) - 1
+        return data[~held] if len(data) > 1 else data, data[held], None
+    blocks = data[: len(data) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)[9::10]
+    whole = ~blocks["next", "done"][:, :-1].any(-1).any(-1)
+    blocks = blocks[whole]
+    return data[~held], data[held], blocks if len(blocks) else None
+
+
+@torch.no_grad()
+def rollout_error(loss: DynamicsLoss, blocks: TensorDictBase) -> Tensor:
+    """Mean distance ‖s - ŝ‖ after the last step of each block ``[blocks, steps]``, raw units."""
+    state, action, next_state = loss.transitions(blocks)
+    predicted = loss.dynamics.rollout(state[:, 0], action)[:, -1]
+    return loss.dynamics.task.system.difference(next_state[:, -1], predicted).norm(dim=-1).mean()

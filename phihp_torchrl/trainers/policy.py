@@ -1,0 +1,313 @@
+"""Phase 2: TD3 in imagination (paper, section 4.2)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor
+
+from phihp_torchrl.agents import (
+    Actor,
+    FlatReplay,
+    TD3Config,
+    TD3Update,
+    TwinQ,
+    Worlds,
+    draw_noise,
+    imagine,
+    imagined_return,
+    make_td3_loss,
+)
+from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
+from phihp_torchrl.envs import make_start_states
+from phihp_torchrl.tasks import Task
+
+
+@dataclass(frozen=True)
+class StartConfig:
+    """Where imagined lives start: shares of each source (see :func:`make_start_states`)."""
+
+    reset: float = 0.2
+    data: float = 0.0
+    coverage: float = 0.6
+    goal: float = 0.2
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Phase 2.
+
+    Args:
+        updates: critic updates in all.
+        batch_size: transitions in an update.
+        num_worlds: imagined worlds.
+        chunk_steps: steps of all worlds between two rounds of updates.
+        updates_per_step: critic updates for each step of all worlds.
+        replay_capacity: transitions kept.
+        random_steps: imagined transitions under random actions before the first update.
+        exploration_noise: std of the noise on actions, in units of the action bounds.
+        random_fraction: share of actions that are uniformly random.
+        max_age: steps after which an imagined life is truncated; ``None`` for the task's own limit.
+        decay: the share of the updates, at the end, over which learning rates fall to a twentieth.
+        evaluation_interval: updates between two evaluations in the model.
+        evaluation_episodes: imagined episodes in an evaluation.
+        evaluation_steps: their length; ``None`` for the task's own limit.
+        max_seconds: stop early after this time; ``None`` for never.
+        start: where imagined lives start.
+        td3: TD3's own hyper-parameters.
+    """
+
+    updates: int = 8000
+    batch_size: int = 128
+    num_worlds: int = 64
+    chunk_steps: int = 4
+    updates_per_step: int = 8
+    replay_capacity: int = 1_000_000
+    random_steps: int = 2048
+    exploration_noise: float = 0.1
+    random_fraction: float = 0.1
+    max_age: int | None = None
+    decay: float = 0.5
+    evaluation_interval: int = 500
+    evaluation_episodes: int = 64
+    evaluation_steps: int | None = None
+    max_seconds: float | None = None
+    start: StartConfig = field(default_factory=StartConfig)
+    td3: TD3Config = field(default_factory=TD3Config)
+
+    def __post_init__(self) -> None:
+        positive = (
+            "updates",
+            "batch_size",
+            "num_worlds",
+            "chunk_steps",
+            "updates_per_step",
+            "replay_capacity",
+            "evaluation_interval",
+            "evaluation_episodes",
+        )
+        for name in positive:
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        for name in ("random_fraction", "decay"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: expected a number in [0, 1], got {getattr(self, name)}.")
+        for name in ("random_steps", "exploration_noise"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
+        for name in ("max_age", "evaluation_steps", "max_seconds"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"{name}: expected a positive number or none, got {value}.")
+        chunk_updates = self.chunk_steps * self.updates_per_step
+        for name, value in (
+            ("chunk_steps * updates_per_step", chunk_updates),
+            ("evaluation_interval", self.evaluation_interval),
+        ):
+            if value % self.td3.policy_delay:
+                raise ValueError(
+                    f"{name}: expected a multiple of td3.policy_delay = {self.td3.policy_delay}, "
+                    f"got {value}."
+                )
+
+
+class PolicyTrainer:
+    """Learns actor and critics from imagined transitions, many worlds at once.
+
+    After every ``evaluation_interval`` updates the noise-free actor plays episodes from the task's
+    resets in the model, and the best actor met is kept together with its critics. Neither the real world
+    nor an evaluation seed has a say in that choice.
+
+    Args:
+        task: the task.
+        dynamics: the model to imagine with; it is not changed.
+        config: phase 2.
+        seed: of everything random here but the networks' initial weights, which come from torch's
+            global generator.
+        data_states: states of real transitions ``[N, n]``, for ``start.data`` > 0.
+        compile: whether to compile the imagined chunk and the TD3 step.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> task = get_task("pendulum")
+        >>> config = PolicyConfig(updates=4, evaluation_interval=4, evaluation_steps=5, random_steps=128)
+        >>> trainer = PolicyTrainer(task, HybridDynamics.oracle(task), config, seed=0)
+        >>> while not trainer.done:
+        ...     metrics = trainer.advance()
+        >>> trainer.best_actor().out_keys
+        ['action']
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        dynamics: HybridDynamics,
+        config: PolicyConfig,
+        *,
+        seed: int,
+        data_states: Tensor | None = None,
+        compile: bool = False,
+    ) -> None:
+        self.task = task
+        self.config = config
+        self.world_model = TaskWorldModel(task, dynamics).requires_grad_(False)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.start_states = make_start_states(task, **vars(config.start), states=data_states)
+        self.loss = make_td3_loss(self.world_model, config.td3)
+        self.update = TD3Update(self.loss, self.world_model, config.td3, compile=compile)
+        self.replay = FlatReplay(
+            config.replay_capacity, task.system.state_dim, task.system.action_dim
+        )
+        self.worlds = self._new_worlds()
+        self.best = [layer.clone() for layer in (*self.update.actor, *self.update.critics)]
+        self.best_return = -math.inf
+        self.updates = 0
+        self.seconds = 0.0
+        self._evaluation_states = task.reset.sample(
+            [config.evaluation_episodes], generator=self.generator
+        )
+        self._imagine = torch.compile(imagine, fullgraph=True) if compile else imagine
+
+    @property
+    def max_age(self) -> int:
+        """Steps that an imagined life lasts at most."""
+        return self.config.max_age or self.task.max_steps
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Critic updates so far and in all."""
+        return self.updates, self.config.updates
+
+    @property
+    def done(self) -> bool:
+        """Whether the budget of updates or seconds is spent."""
+        limit = self.config.max_seconds
+        return self.updates >= self.config.updates or (limit is not None and self.seconds > limit)
+
+    @torch.no_grad()
+    def advance(self) -> dict[str, float]:
+        """Train for one evaluation interval and evaluate; returns what to log."""
+        start = time.perf_counter()
+        config = self.config
+        until = min(self.updates + config.evaluation_interval, config.updates)
+        losses: dict[str, Tensor] = {}
+        while self.updates < until:
+            round_end = config.chunk_steps * config.updates_per_step
+            if self.updates % round_end == 0:
+                self._imagine_chunk()
+            for _ in range(min(round_end - self.updates % round_end, until - self.updates)):
+                if self.updates % config.td3.policy_delay == 0:
+                    losses = self._learn()
+                self.updates += 1
+        score = imagined_return(
+            self.world_model,
+            self.update.actor,
+            self._evaluation_states,
+            self.loss.max_action,
+            config.evaluation_steps or self.task.max_steps,
+        )
+        imagined = torch.nan_to_num(score, nan=-math.inf).mean().item()
+        if imagined > self.best_return:
+            self.best_return = imagined
+            for kept, layer in zip(self.best, self._layers(), strict=True):
+                kept.copy_(layer)
+        self.seconds += time.perf_counter() - start
+        return {
+            "policy/updates": float(self.updates),
+            "policy/imagined_steps": float(self.replay.written),
+            "policy/imagined_return": imagined,
+            "policy/best_imagined_return": self.best_return,
+            "policy/seconds": self.seconds,
+            **{f"policy/{name}": value.item() for name, value in losses.items()},
+        }
+
+    def actor(self) -> TensorDictModule:
+        """The actor as it is now."""
+        return _as_actor(Actor.from_layers(self.task, self.update.actor))
+
+    def best_actor(self) -> TensorDictModule:
+        """The actor with the best imagined return so far."""
+        return _as_actor(Actor.from_layers(self.task, self.best[: len(self.update.actor)]))
+
+    def best_qvalue(self) -> TensorDictModule:
+        """The twin critics that were the best actor's."""
+        critics = TwinQ.from_layers(self.task, self.best[len(self.update.actor) :])
+        return TensorDictModule(critics, ["observation", "action"], ["state_action_value"])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a resumed run needs, tensors and numbers only."""
+        return {
+            "update": self.update.state_dict(),
+            "replay": self.replay.state_dict(),
+            "worlds": list(self.worlds),
+            "best": list(self.best),
+            "best_return": self.best_return,
+            "updates": self.updates,
+            "seconds": self.seconds,
+            "evaluation_states": self._evaluation_states,
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from :meth:`state_dict`."""
+        self.update.load_state_dict(state["update"])
+        self.replay.load_state_dict(state["replay"])
+        self.worlds = Worlds(*state["worlds"])
+        for kept, layer in zip(self.best, state["best"], strict=True):
+            kept.copy_(layer)
+        self.best_return = state["best_return"]
+        self.updates = state["updates"]
+        self.seconds = state["seconds"]
+        self._evaluation_states = state["evaluation_states"]
+        self.generator.set_state(state["generator"])
+
+    def _layers(self) -> list[Tensor]:
+        return [*self.update.actor, *self.update.critics]
+
+    def _new_worlds(self) -> Worlds:
+        count = self.config.num_worlds
+        age = torch.randint(self.max_age, (count,), generator=self.generator)
+        return Worlds(self.start_states.sample([count], self.generator), age)
+
+    def _imagine_chunk(self) -> None:
+        config = self.config
+        while True:
+            warm = len(self.replay) >= config.random_steps
+            noise = draw_noise(
+                self.start_states.sample([config.chunk_steps, config.num_worlds], self.generator),
+                self.loss.max_action,
+                std=config.exploration_noise,
+                random_fraction=config.random_fraction if warm else 1.0,
+                generator=self.generator,
+            )
+            batch, self.worlds = self._imagine(
+                self.world_model,
+                self.update.actor,
+                self.worlds,
+                noise,
+                self.loss.max_action,
+                self.max_age,
+            )
+            self.replay.extend(batch)
+            if warm:
+                return
+
+    def _learn(self) -> dict[str, Tensor]:
+        config = self.config
+        left = 1.0 - self.updates / config.updates
+        scale = 1.0 if config.decay == 0 else max(0.05, min(1.0, left / config.decay))
+        batches = [
+            self.replay.sample(config.batch_size, self.generator)
+            for _ in range(config.td3.policy_delay)
+        ]
+        return self.update(batches, scale, self.generator)
+
+
+def _as_actor(actor: Actor) -> TensorDictModule:
+    return TensorDictModule(actor, ["observation"], ["action"])
