@@ -1,0 +1,42 @@
+"""A trainer for each phase, and the run that carries them through."""
+
+from __future__ import annotations
+
+from phihp_torchrl.trainers.config import ConfigError, from_mapping, to_mapping
+from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
+from phihp_torchrl.trainers.model import CollectConfig, ModelConfig, ModelTrainer
+from phihp_torchrl.trainers.phases import read_result
+from phihp_torchrl.trainers.policy import PolicyConfig, PolicyTrainer, StartConfig
+from phihp_torchrl.trainers.run import RunResult, run
+from phihp_torchrl.trainers.run_config import (
+    EvaluateConfig,
+    RunConfig,
+    RunRequest,
+    import_plugins,
+    read_request,
+)
+from phihp_torchrl.trainers.show import show_episode
+
+__all__ = [
+    "CollectConfig",
+    "ConfigError",
+    "EvaluateConfig",
+    "LoggerConfig",
+    "ModelConfig",
+    "ModelTrainer",
+    "PolicyConfig",
+    "PolicyTrainer",
+    "RunConfig",
+    "RunLogger",
+    "RunRequest",
+    "RunResult",
+    "StartConfig",
+    "from_mapping",
+    "import_plugins",
+    "make_logger",
+    "read_request",
+    "read_result",
+    "run",
+    "show_episode",
+    "to_mapping",
+]

@@ -1,0 +1,195 @@
+"""Where metrics, pictures and the agent go besides the run directory."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from torchrl.record.loggers import get_logger
+
+_log = logging.getLogger(__name__)
+
+REAL_STEPS = "real_steps"
+"""Steps taken in the real world: the axis of all metrics."""
+
+
+@dataclass(frozen=True)
+class LoggerConfig:
+    """Which logger, and what wandb wants to know.
+
+    Args:
+        name: ``"csv"``, ``"wandb"`` or ``"tensorboard"``.
+        project: wandb's project.
+        entity: wandb's user or team; by default its own default.
+        group: runs to show together, such as the seeds of one experiment.
+        tags: labels of the run.
+        mode: ``"online"``, ``"offline"``, ``"disabled"``; by default what the variable
+            ``WANDB_MODE`` says, otherwise online.
+    """
+
+    name: Literal["csv", "wandb", "tensorboard"] = "csv"
+    project: str = "phihp"
+    entity: str | None = None
+    group: str | None = None
+    tags: tuple[str, ...] = ()
+    mode: Literal["online", "offline", "disabled"] | None = None
+
+
+class RunLogger:
+    """The csv logger: nothing to do, for the run directory has ``metrics.csv`` and all files."""
+
+    id: str | None = None
+    """What a resumed run needs to go on with the same log."""
+
+    def log(self, metrics: Mapping[str, Any], unit: int) -> None:
+        """Log the metrics of one unit of work, ``real_steps`` among them."""
+
+    def log_file(self, name: str, path: Path, unit: int) -> None:
+        """Log a picture (``.png``) or a video (``.gif``)."""
+
+    def log_agent(self, name: str, path: Path, unit: int) -> None:
+        """Log the directory of an agent."""
+
+    def close(self) -> None:
+        """Write what is still in memory."""
+
+
+class WandbRunLogger(RunLogger):
+    """wandb, through TorchRL's logger, with real environment steps as the axis of every metric."""
+
+    def __init__(
+        self, config: LoggerConfig, run: Mapping[str, Any], directory: Path, run_id: str | None
+    ) -> None:
+        import wandb
+
+        options = {"entity": config.entity, "group": config.group, "tags": list(config.tags)}
+        options = {key: value for key, value in options.items() if value}
+        mode = {"mode": config.mode} if config.mode else {}
+        self._logger = get_logger(
+            "wandb",
+            str(directory),
+            directory.name,
+            wandb_kwargs={
+                "project": config.project,
+                "id": run_id,
+                "config": dict(run),
+                "log_env_packages": False,
+                # By default wandb retries for a minute and a half before it gives up.
+                "settings": wandb.Settings(init_timeout=30, silent=True),
+                **options,
+                **mode,
+            },
+        )
+        self._run = self._logger.experiment
+        self.id = self._run.id
+        self._run.define_metric(REAL_STEPS)
+        self._run.define_metric("*", step_metric=REAL_STEPS)
+
+    def log(self, metrics: Mapping[str, Any], unit: int) -> None:
+        # wandb ignores a unit that it has already: what a resumed run earns again is the same.
+        self._run.log(dict(metrics), step=unit)
+
+    def log_file(self, name: str, path: Path, unit: int) -> None:
+        import wandb
+
+        if path.suffix == ".png":
+            self._run.log({name: wandb.Image(str(path))}, step=unit)
+        else:
+            self._run.log({name: wandb.Video(str(path), format="gif")}, step=unit)
+
+    def log_agent(self, name: str, path: Path, unit: int) -> None:
+        import wandb
+
+        artifact = wandb.Artifact(name, type="agent")
+        artifact.add_dir(str(path))
+        self._run.log_artifact(artifact)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+class TensorboardRunLogger(RunLogger):
+    """TensorBoard; its axis is the unit of work, real steps are a metric among the others."""
+
+    def __init__(self, directory: Path, resume_unit: int | None) -> None:
+        self._logger = get_logger("tensorboard", str(directory), "tensorboard")
+        self._writer = self._logger.experiment
+        if resume_unit is not None:
+            self._forget_from(resume_unit)
+
+    def _forget_from(self, unit: int) -> None:
+        """Tell TensorBoard to drop what a killed run logged after its last checkpoint."""
+        from tensorboard.compat.proto import event_pb2  # type: ignore[import-untyped]
+
+        session = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
+        event = event_pb2.Event(step=unit, session_log=session)
+        self._writer.file_writer.add_event(event, unit)
+
+    def log(self, metrics: Mapping[str, Any], unit: int) -> None:
+        for name, value in metrics.items():
+            if isinstance(value, (int, float)):
+                self._logger.log_scalar(name, value, step=unit)
+
+    def log_file(self, name: str, path: Path, unit: int) -> None:
+        if path.suffix == ".png":
+            from matplotlib import pyplot
+
+            self._writer.add_image(name, pyplot.imread(path)[..., :3], unit, dataformats="HWC")
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+def make_logger(
+    config: LoggerConfig,
+    run: Mapping[str, Any],
+    directory: Path,
+    *,
+    run_id: str | None = None,
+    resume_unit: int | None = None,
+) -> RunLogger:
+    """Open the logger that ``config`` asks for, or warn and leave it at ``metrics.csv``.
+
+    Nothing here asks a question on the terminal.
+
+    Args:
+        config: which logger.
+        run: the whole configuration of the run, to be logged with it.
+        directory: the run directory.
+        run_id: :attr:`RunLogger.id` of the run to go on with.
+        resume_unit: the first unit that will be logged, in a resumed run.
+    """
+    try:
+        if config.name == "wandb":
+            _check_wandb_key(config)
+            return WandbRunLogger(config, run, directory, run_id)
+        if config.name == "tensorboard":
+            return TensorboardRunLogger(directory, resume_unit)
+    # A logger must never end a run, whatever its package or the network comes up with.
+    except Exception as error:
+        _log.warning(
+            "logger=%s is not to be had (%s); metrics go to %s alone.",
+            config.name,
+            error,
+            directory / "metrics.csv",
+        )
+    return RunLogger()
+
+
+def _check_wandb_key(config: LoggerConfig) -> None:
+    """Fail where wandb.init would ask for a key."""
+    import wandb
+
+    mode = config.mode or os.environ.get("WANDB_MODE", "online")
+    if mode not in ("online", "run"):
+        return
+    try:
+        known = wandb.login(prompt=False, verify=False)
+    except TypeError:  # wandb before 0.2x has no `prompt`
+        known = bool(wandb.api.api_key)
+    if not known:
+        raise RuntimeError("it has no key; log in with `wandb login`, or use logger.mode=offline")

@@ -1,0 +1,240 @@
+"""The configuration of a run, from the command line to typed dataclasses."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import DictConfig, OmegaConf
+
+from phihp_torchrl.evaluation.seeds import check_training_seed
+from phihp_torchrl.planners.factory import PlannerConfig
+from phihp_torchrl.tasks import get_task
+from phihp_torchrl.trainers.config import ConfigError, from_mapping
+from phihp_torchrl.trainers.loggers import LoggerConfig
+from phihp_torchrl.trainers.model import ModelConfig
+from phihp_torchrl.trainers.policy import PolicyConfig
+from phihp_torchrl.trainers.run_directory import RunDirectory
+
+PHASES = ("model", "policy", "evaluate")
+"""The phases in their order: learn the model, learn the policy in it, act with both."""
+
+FREE_KEYS = ("checkpoint_interval", "keep_checkpoints", "progress", "logger")
+"""What a resumed run may change, for it changes no result."""
+
+_GROUPS = ("task", "preset", "logger")
+_PLACES = ("run_dir", "resume")
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """The last phase: how the trained agent is judged and shown.
+
+    Args:
+        episodes: real episodes, from seeds that no training ever uses.
+        latency_actions: actions whose time is measured, one at a time; 0 for none.
+        video: whether to write a GIF of an episode.
+    """
+
+    episodes: int = 50
+    latency_actions: int = 200
+    video: bool = True
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"episodes: expected a positive number, got {self.episodes}.")
+        if self.latency_actions < 0:
+            raise ValueError(
+                f"latency_actions: expected a number >= 0, got {self.latency_actions}."
+            )
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """All that decides what a run does; ``recipes/config/phihp.yaml`` mirrors it.
+
+    Args:
+        task: name of a registered task.
+        preset: name of the set of hyper-parameters, for the record.
+        seed: of everything random.
+        phases: consecutive ones of :data:`PHASES`.
+        start_from: directory of a run that has done the phases before (``from`` in YAML).
+        plugins: Python files or modules to import, which register tasks.
+        checkpoint_interval: seconds between two checkpoints; 0 for one after every unit of work.
+        keep_checkpoints: how many of them stay.
+        threads: intra-op threads.
+        compile: whether to compile the hot loops.
+        progress: whether to show progress bars, on a terminal.
+        model: phase 1.
+        policy: phase 2.
+        planner: how the agent plans, in phase 3.
+        evaluate: phase 3.
+        logger: where metrics go besides ``metrics.csv``.
+    """
+
+    task: str
+    preset: str = "default"
+    seed: int = 0
+    phases: tuple[str, ...] = PHASES
+    start_from: str | None = field(default=None, metadata={"key": "from"})
+    plugins: tuple[str, ...] = ()
+    checkpoint_interval: float = 60.0
+    keep_checkpoints: int = 2
+    threads: int = 1
+    compile: bool = False
+    progress: bool = True
+    model: ModelConfig = field(default_factory=ModelConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
+    logger: LoggerConfig = field(default_factory=LoggerConfig)
+
+    def __post_init__(self) -> None:
+        check_training_seed(self.seed)
+        for name in ("keep_checkpoints", "threads"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        if not self.checkpoint_interval >= 0:
+            raise ValueError(
+                f"checkpoint_interval: expected seconds >= 0, got {self.checkpoint_interval}."
+            )
+        self._check_phases()
+
+    def _check_phases(self) -> None:
+        first = PHASES.index(self.phases[0]) if self.phases and self.phases[0] in PHASES else 0
+        consecutive = PHASES[first : first + len(self.phases)]
+        if not self.phases or tuple(self.phases) != consecutive:
+            raise ValueError(
+                f"phases: expected consecutive ones of {list(PHASES)}, got {list(self.phases)}."
+            )
+        if first > 0 and self.start_from is None:
+            raise ValueError(
+                f"from: expected the directory of a run that has done phase {PHASES[first - 1]!r}, "
+                f"for phases={list(self.phases)}."
+            )
+        if first == 0 and self.start_from is not None:
+            raise ValueError("from: expected none, for phases begin with the first one.")
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What a command line asks for.
+
+    Args:
+        config: the run.
+        path: its directory; ``None`` for a new one.
+        resume: whether to go on with the run there.
+    """
+
+    config: RunConfig
+    path: str | None
+    resume: bool
+
+
+def read_request(composed: DictConfig, overrides: Sequence[str]) -> RunRequest:
+    """Turn what Hydra composed into a typed request, and import its plugins.
+
+    A task's YAML has a section for each preset. It goes over the preset, and the command line over
+    both; so the command line is applied once more.
+
+    Args:
+        composed: the composed configuration.
+        overrides: the command line, as ``HydraConfig.get().overrides.task`` has it.
+
+    Raises:
+        ConfigError: for the first key that is unknown or has a wrong value, by its dotted name.
+    """
+    lines = [
+        o for o in OverridesParser.create().parse_overrides(list(overrides)) if not o.is_delete()
+    ]
+    config: Any = OmegaConf.create(OmegaConf.to_container(composed, resolve=True))
+    places = {key: config.pop(key, None) for key in _PLACES}
+    for key, value in places.items():
+        if value is not None and not isinstance(value, str):
+            raise ConfigError(f"{key}: expected a directory, got {value!r}.")
+    presets = config.pop("presets", None) or {}
+    if places["resume"] is None:
+        section = presets.get(config.get("preset")) or {}
+        _check_section(section, config)
+        config = OmegaConf.merge(config, section)
+    else:
+        if places["run_dir"] is not None:
+            raise ConfigError("run_dir: expected none with resume, which names the directory.")
+        config, given = OmegaConf.create(RunDirectory(places["resume"]).read_config()), config
+        if any(_key(line) == "logger" for line in lines):
+            config.logger = given.logger
+    for line in lines:
+        if _key(line) in _GROUPS[:2]:
+            config[_key(line)] = str(line.value())
+        elif _key(line) not in (*_GROUPS, *_PLACES):
+            OmegaConf.update(config, _key(line), line.value(), force_add=True)
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    import_plugins(plain.get("plugins") or ())
+    typed = from_mapping(RunConfig, plain)
+    _check_task(typed.task)
+    path = places["resume"] or places["run_dir"]
+    return RunRequest(typed, path, resume=places["resume"] is not None)
+
+
+def import_plugins(plugins: Sequence[str]) -> None:
+    """Import Python files (``path/to/my_task.py``) or modules (``my_package.tasks``), each once.
+
+    Raises:
+        ConfigError: for one that is absent or fails, named in the message.
+    """
+    for name in plugins:
+        if not isinstance(name, str):
+            raise ConfigError(f"plugins: expected files or modules, got {name!r}.")
+        try:
+            if name.endswith(".py"):
+                _import_file(Path(name))
+            else:
+                importlib.import_module(name)
+        # A user's file may fail in any way; he should read which one, and why.
+        except Exception as error:
+            raise ConfigError(
+                f"plugins: {name} cannot be imported: {type(error).__name__}: {error}"
+            ) from error
+
+
+def _import_file(path: Path) -> None:
+    path = path.resolve()
+    module_name = f"phihp_torchrl_plugin_{path.stem}"
+    if getattr(sys.modules.get(module_name), "__file__", None) == str(path):
+        return
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError("not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    sys.modules[module_name] = module
+
+
+def _key(line: Override) -> str:
+    return str(line.key_or_group)
+
+
+def _check_task(name: str) -> None:
+    try:
+        get_task(name)
+    except ValueError as error:
+        raise ConfigError(f"{error} A plugin may register more: plugins=[my_task.py].") from error
+
+
+def _check_section(section: Mapping[str, Any], config: Mapping[str, Any], path: str = "") -> None:
+    """A task's section may only set what the preset has."""
+    for key, value in section.items():
+        name = f"{path}.{key}" if path else str(key)
+        if key not in config:
+            raise ConfigError(
+                f"presets.<preset>.{name}: unknown key; expected one of {sorted(config)}."
+            )
+        if isinstance(value, Mapping) and isinstance(config[key], Mapping):
+            _check_section(value, config[key], name)

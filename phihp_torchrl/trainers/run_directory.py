@@ -1,0 +1,214 @@
+"""What a run leaves on disk, so that it can be read, repeated and resumed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+from torchrl.checkpoint import CheckpointRotation
+
+from phihp_torchrl.trainers.config import ConfigError
+
+_PACKAGES = ("phihp_torchrl", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
+
+
+class RunDirectory:
+    """The directory of a run, and the names of what is in it.
+
+    ========================= =====================================================================
+    ``config.yaml``           the whole configuration
+    ``metadata.json``         seed, commit, command, machine, versions, seconds of each phase
+    ``metrics.csv``           a row for each unit of work
+    ``checkpoints/``          the last few states of the phase under way
+    ``phases/<phase>/``       the state each finished phase ended with
+    ``agent/``, ``episode.*`` what the last phase makes: the agent, a picture and a GIF
+    ========================= =====================================================================
+
+    Args:
+        path: the directory.
+        keep_checkpoints: how many checkpoints stay.
+    """
+
+    def __init__(self, path: str | Path, keep_checkpoints: int = 2) -> None:
+        self.path = Path(path)
+        self.config = self.path / "config.yaml"
+        self.metadata = self.path / "metadata.json"
+        self.metrics = self.path / "metrics.csv"
+        self.agent = self.path / "agent"
+        self.evaluation = self.path / "evaluation.json"
+        self.rotation = CheckpointRotation(
+            self.path / "checkpoints", keep_last=keep_checkpoints, prefix="unit"
+        )
+
+    def phase(self, name: str) -> Path:
+        """Where the final state of a phase is."""
+        return self.path / "phases" / name
+
+    def read_config(self) -> dict[str, Any]:
+        """The configuration that the run was started with.
+
+        Raises:
+            ConfigError: if this is no run directory, or its configuration cannot be read.
+        """
+        if not self.config.is_file():
+            raise ConfigError(f"{self.path}: not the directory of a run, it has no config.yaml.")
+        try:
+            config = OmegaConf.to_container(OmegaConf.load(self.config))
+        except Exception as error:  # YAML's, OmegaConf's and the system's errors have no base
+            raise ConfigError(f"{self.config}: cannot be read: {error}") from error
+        if not isinstance(config, dict):
+            raise ConfigError(f"{self.config}: expected keys and values, got {config!r}.")
+        return config  # type: ignore[return-value]
+
+    def write_config(self, config: Mapping[str, Any]) -> None:
+        """Write the configuration, as YAML."""
+        write_atomically(self.config, OmegaConf.to_yaml(OmegaConf.create(dict(config))))
+
+    def read_metadata(self) -> dict[str, Any]:
+        """What :meth:`write_metadata` wrote; empty if nothing was."""
+        try:
+            return json.loads(self.metadata.read_text())
+        except FileNotFoundError:
+            return {}
+        except ValueError as error:
+            raise ConfigError(f"{self.metadata}: cannot be read: {error}") from error
+
+    def write_metadata(self, metadata: Mapping[str, Any]) -> None:
+        """Write where the run comes from and how long it took, as JSON."""
+        write_atomically(self.metadata, json.dumps(metadata, indent=2) + "\n")
+
+
+def new_run_directory(task: str, preset: str, seed: int) -> Path:
+    """Make ``outputs/<task>/<time>-<preset>-seed<seed>``, numbered where that is taken."""
+    parent = Path("outputs") / task
+    parent.mkdir(parents=True, exist_ok=True)
+    name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{preset}-seed{seed}"
+    for number in range(1, 1000):
+        path = parent / (name if number == 1 else f"{name}-{number}")
+        try:
+            path.mkdir()
+        except FileExistsError:
+            continue
+        return path
+    raise ConfigError(f"run_dir: {parent / name} and 998 more are taken; name one.")
+
+
+def describe_origin(seed: int) -> dict[str, Any]:
+    """Seed, time, command, commit, machine and versions."""
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "not installed"
+    status = _git("status", "--porcelain", "--untracked-files=no")
+    return {
+        "seed": seed,
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "commit": _git("rev-parse", "HEAD"),
+        "dirty": None if status is None else bool(status),
+        "machine": {
+            "system": f"{platform.system()} {platform.machine()}",
+            "cpus": os.cpu_count(),
+            "memory_gib": _memory_gib(),
+            "gpus": torch.cuda.device_count(),
+        },
+        "versions": versions,
+    }
+
+
+def _memory_gib() -> float | None:
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (AttributeError, ValueError, OSError):  # not every system tells
+        return None
+
+
+def _git(*arguments: str) -> str | None:
+    """What git says about the source tree; ``None`` where there is no git or no repository."""
+    try:
+        done = subprocess.run(
+            ["git", *arguments],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace the file at ``path`` in one step: readers see the old text or the new."""
+    stage = path.with_name(f".{path.name}.stage")
+    stage.write_text(text)
+    os.replace(stage, path)
+
+
+class MetricsTable:
+    """A CSV file with a row for each unit of work; new metrics become new columns.
+
+    Args:
+        path: the file.
+        rows: how many of its rows to keep, where it exists: those that the checkpoint to resume
+            from knows. The later ones will be earned again.
+
+    Examples:
+        >>> import tempfile
+        >>> table = MetricsTable(Path(tempfile.mkdtemp()) / "metrics.csv")
+        >>> table.append({"unit": 0, "loss": 1.5})
+        >>> table.append({"unit": 1, "return": -300.0})
+        >>> print(table.path.read_text())
+        unit,loss,return
+        0,1.5,
+        1,,-300.0
+        <BLANKLINE>
+    """
+
+    def __init__(self, path: Path, rows: int = 0) -> None:
+        self.path = path
+        self._columns: list[str] = []
+        kept: list[dict[str, str]] = []
+        if rows and path.exists():
+            with path.open(newline="") as file:
+                reader = csv.DictReader(file)
+                kept = [row for _, row in zip(range(rows), reader, strict=False)]
+                # Columns that only later rows had come again, in their order, with those rows.
+                columns = reader.fieldnames or []
+                self._columns = [c for c in columns if any(row[c] for row in kept)]
+        self._write(kept)
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Add a row."""
+        if new := [name for name in row if name not in self._columns]:
+            with self.path.open(newline="") as file:
+                old = list(csv.DictReader(file))
+            self._columns += new
+            self._write(old)
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, self._columns, lineterminator="\n").writerow(row)
+
+    def _write(self, rows: list[dict[str, str]]) -> None:
+        stage = self.path.with_name(f".{self.path.name}.stage")
+        with stage.open("w", newline="") as file:
+            if self._columns:
+                writer = csv.DictWriter(
+                    file, self._columns, lineterminator="\n", extrasaction="ignore"
+                )
+                writer.writeheader()
+                writer.writerows(rows)
+        os.replace(stage, self.path)
