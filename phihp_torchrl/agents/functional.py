@@ -1,7 +1,7 @@
 """TD3's equations as pure functions on tensors (Fujimoto et al., 2018, arXiv:1802.09477).
 
-Everything here compiles into one graph. Networks are flat sequences of tensors ``(weight, bias, weight,
-bias, …)``; those of the critics carry a leading dimension, one entry a critic, as
+Everything here compiles into one graph. Networks are flat sequences of tensors ``(weight, bias,
+weight, bias, …)``; those of the critics carry a leading dimension, one entry a critic, as
 :class:`torchrl.objectives.TD3Loss` stacks them.
 """
 
@@ -68,9 +68,9 @@ def td3_target(
     .. math::
         y = \sum_{i<k} \gamma^i r_i + \gamma^k \min_j Q'_j(s_k, \mathrm{clip}(\pi'(s_k) + \epsilon))
 
-    with nothing after a termination. The first reward is the batch's; with ``expansion`` k > 1 the model
-    carries on for k - 1 steps under the target policy (model-based value expansion, Feinberg et al.,
-    2018, arXiv:1803.00101).
+    with nothing after a termination. The first reward is the batch's; with ``expansion`` k > 1 the
+    model carries on for k - 1 steps under the target policy (model-based value expansion, Feinberg
+    et al., 2018, arXiv:1803.00101).
 
     Args:
         batch: transitions.
@@ -82,12 +82,17 @@ def td3_target(
         observe: state -> observation.
         transition: the model, needed for ``expansion`` > 1.
         expansion: number of rewards in the sum, k.
+
+    Raises:
+        ValueError: for ``expansion`` > 1 without ``transition``.
     """
     value = batch.reward
     state = batch.next_state
     alive = 1.0 - batch.terminated.to(value.dtype)
     discount = gamma * alive
     for _ in range(expansion - 1):
+        if transition is None:
+            raise ValueError(f"transition: expected the model for expansion={expansion}, got none.")
         state, reward, terminated = transition(state, policy(actor, observe(state), action_high))
         value = value + discount * reward
         discount = gamma * discount * (1.0 - terminated.to(value.dtype))
@@ -144,6 +149,6 @@ def adam_(
 
 
 def soft_update_(targets: Layers, sources: Layers, tau: float) -> None:
-    """targets ← (1 - tau) targets + tau sources, in place."""
+    """Move the targets in place: targets ← (1 - tau) targets + tau sources."""
     for target, source in zip(targets, sources, strict=True):
         target.lerp_(source, tau)

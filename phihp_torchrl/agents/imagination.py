@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -51,7 +51,7 @@ def draw_noise(
         generator: source of randomness.
     """
     shape = start_states.shape[:-1]
-    options = {"generator": generator, "device": start_states.device}
+    options: dict[str, Any] = {"generator": generator, "device": start_states.device}
     exploration = std * torch.randn([*shape, action_high.shape[0]], **options)
     uniform = 2.0 * torch.rand([*shape, action_high.shape[0]], **options) - 1.0
     use_random = torch.rand(shape, **options) < random_fraction
@@ -68,9 +68,10 @@ def imagine(
 ) -> tuple[Batch, Worlds]:
     """Step all worlds through a chunk under the noisy policy.
 
-    A world that terminates, leaves the finite numbers or reaches ``max_age`` steps goes on from a new
-    start state. Reaching ``max_age`` is truncation: it is not recorded as ``terminated``. A transition
-    into non-finite numbers is recorded as staying put with termination, and harms nothing.
+    A world that terminates, leaves the finite numbers or reaches ``max_age`` steps goes on from a
+    new start state. Reaching ``max_age`` is truncation: it is not recorded as ``terminated``. A
+    transition into non-finite numbers is recorded as staying put with termination, and harms
+    nothing.
 
     Args:
         world_model: the model.

@@ -14,7 +14,7 @@ from phihp_torchrl.tasks import Task
 
 
 class Actor(nn.Module):
-    """A deterministic policy: observation ``[*batch, o]`` -> action ``[*batch, m]`` in physical units.
+    """A deterministic policy: observation ``[*batch, o]`` -> physical action ``[*batch, m]``.
 
     Args:
         task: gives the sizes and the action bounds.

@@ -11,8 +11,8 @@ from phihp_torchrl.agents.functional import Batch
 class FlatReplay(nn.Module):
     """Uniform replay of transitions, one row of one tensor each.
 
-    Sampling is a single gather, where a dictionary of storages needs one per entry. The whole buffer
-    is module state, so checkpoints carry it.
+    Sampling is a single gather, where a dictionary of storages needs one per entry. The whole
+    buffer is module state, so checkpoints carry it.
 
     Args:
         capacity: number of transitions kept; the oldest make room.
@@ -33,7 +33,9 @@ class FlatReplay(nn.Module):
     def __init__(self, capacity: int, state_dim: int, action_dim: int) -> None:
         super().__init__()
         if capacity < 1:
-            raise ValueError(f"capacity: expected a positive number of transitions, got {capacity}.")
+            raise ValueError(
+                f"capacity: expected a positive number of transitions, got {capacity}."
+            )
         self.sizes = (state_dim, action_dim, 1, state_dim, 1)
         self.register_buffer("rows", torch.zeros(capacity, sum(self.sizes)))
         self.register_buffer("cursor", torch.zeros((), dtype=torch.int64))

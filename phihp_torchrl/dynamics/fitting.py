@@ -19,16 +19,17 @@ class FitConfig:
     """How to fit the model.
 
     Args:
-        method: ``"levenberg_marquardt"`` or ``"adam"``. The model is small and its loss a sum of squares,
-            so a second-order method reaches errors in seconds that Adam does not reach at all.
+        method: ``"levenberg_marquardt"`` or ``"adam"``. The model is small and its loss a sum of
+            squares, so a second-order method reaches errors in seconds that Adam does not reach at
+            all.
         steps: steps of the method.
         scaled: whether errors are measured in units of one-step changes
             (:meth:`DynamicsLoss.set_scales`), or in raw units as published.
         batch_size: transitions per step; ``None`` for all of them, as published.
         learning_rate: of Adam.
         cosine_decay: whether Adam's learning rate decays to zero.
-        initial_lambda: where Levenberg-Marquardt's lambda starts. A small one makes the prior explain
-            what it can before the residual may take part.
+        initial_lambda: where Levenberg-Marquardt's lambda starts. A small one makes the prior
+            explain what it can before the residual may take part.
         final_lambda: where it ends.
         patience: Levenberg-Marquardt stops after this many steps, at its final lambda, that did not
             improve the held-out error by a tenth.
@@ -153,9 +154,10 @@ def _levenberg_marquardt(
     damping = 1e-2
     growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
     loss.lambda_.fill_(config.initial_lambda)
-    best, best_error, stale, step = theta, math.inf, 0, 0
-    for step in range(1, config.steps + 1):
-        rows = data
+    best, best_error, stale, steps = theta, math.inf, 0, 0
+    while steps < config.steps:
+        steps += 1
+        rows: tuple[Tensor, ...] = data
         if config.batch_size is not None and config.batch_size < len(train):
             index = torch.randint(len(train), (config.batch_size,), generator=generator)
             rows = tuple(part[index] for part in data)
@@ -169,7 +171,7 @@ def _levenberg_marquardt(
             break
         loss.lambda_.mul_(growth).clamp_(max=config.final_lambda)
     system.write(best)
-    return step
+    return steps
 
 
 class _LeastSquares:

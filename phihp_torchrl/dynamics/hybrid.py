@@ -115,7 +115,7 @@ class HybridDynamics(nn.Module):
 
     @classmethod
     def oracle(cls, task: Task, *, integrator: str | Integrator | None = None) -> HybridDynamics:
-        """The world itself: true constants, friction, its integrator by default; nothing to learn."""
+        """The world itself, friction and (by default) its integrator included; nothing to learn."""
         prior = WorldPhysics(task.system)
         return cls(task, prior=prior, residual=None, integrator=integrator or task.integrator)
 
@@ -129,6 +129,7 @@ class HybridDynamics(nn.Module):
     def derivative(self, state: Tensor, action: Tensor) -> Tensor:
         """ds/dt = F^p + F^r, ``[*batch, n]``."""
         if self.prior is None:
+            assert self.residual is not None  # __init__ asks for at least one
             return self.residual(state, action)
         if self.residual is None:
             return self.prior(state, action)
@@ -136,7 +137,7 @@ class HybridDynamics(nn.Module):
 
     @torch.no_grad()
     def residual_share(self, state: Tensor, action: Tensor) -> Tensor:
-        """How much of the motion the residual explains: ‖F^r‖ / (‖F^p‖ + ‖F^r‖), scalar in [0, 1]."""
+        """What the residual explains of the motion: ‖F^r‖ / (‖F^p‖ + ‖F^r‖), scalar in [0, 1]."""
         zero = torch.zeros((), dtype=state.dtype, device=state.device)
         prior = zero if self.prior is None else self.prior(state, action).norm()
         residual = zero if self.residual is None else self.residual(state, action).norm()

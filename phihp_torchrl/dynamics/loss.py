@@ -95,8 +95,8 @@ class DynamicsLoss(LossModule):
                 ``("next", "observation")`` ``[*batch, o]``.
 
         Returns:
-            ``loss_prediction`` and ``loss_residual``, whose sum is to be minimised, and the detached
-            ``residual_norm``; scalars.
+            ``loss_prediction`` and ``loss_residual``, whose sum is to be minimised, and the
+            detached ``residual_norm``; scalars.
         """
         error, residual = self.terms(*self.transitions(tensordict))
         loss_prediction = error.square().sum(-1).mean()
@@ -142,5 +142,6 @@ class DynamicsLoss(LossModule):
         size = rate.std(0).clamp_min(1e-3)
         self.error_scale.copy_(size * task.time_step)
         self.residual_scale.copy_(size)
-        if hasattr(self.dynamics.residual, "set_scales"):
-            self.dynamics.residual.set_scales(state, action, rate)
+        set_scales = getattr(self.dynamics.residual, "set_scales", None)
+        if callable(set_scales):
+            set_scales(state, action, rate)

@@ -11,7 +11,7 @@ from phihp_torchrl.systems import System
 
 
 class PhysicsPrior(nn.Module):
-    """F^p(s, a; theta_p): a system's frictionless equations, constants learnable from a first guess.
+    """F^p(s, a; theta_p): a system's frictionless equations, constants learned from a first guess.
 
     Constants are kept as logarithms, so they stay positive and a step changes them by a ratio.
 

@@ -20,8 +20,8 @@ class ResidualMLP(nn.Module):
     Args:
         system: whose state and action these are.
         hidden_sizes: widths of the hidden layers (paper: 2 x 16, Acrobots 3 x 16).
-        outputs: indices of the components of ds/dt that the network may change; the others get zero.
-            ``None`` means all of them, as in the paper.
+        outputs: indices of the components of ds/dt that the network may change; the others get
+            zero. ``None`` means all of them, as in the paper.
         activation: class of the activation (paper: ReLU).
 
     Examples:

@@ -14,8 +14,8 @@ class TaskWorldModel(WorldModel):
 
     The encoder and decoder are the system's observation map, the heads are the task's functions, so
     the dynamics are all that is learned. Besides the TensorDict interface of
-    :class:`torchrl.modules.WorldModel` it offers the same as pure functions of tensors, which planners
-    and imagination compile: :meth:`locate`, :meth:`observe`, :meth:`transition`.
+    :class:`torchrl.modules.WorldModel` it offers the same as pure functions of tensors, which
+    planners and imagination compile: :meth:`locate`, :meth:`observe`, :meth:`transition`.
 
     Args:
         task: the task.
@@ -63,7 +63,7 @@ class TaskWorldModel(WorldModel):
         return self.task.system.observe(state)
 
     def transition(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One step: next state ``[*batch, n]``, reward ``[*batch]``, terminated, bool ``[*batch]``."""
+        """One step: next state ``[*batch, n]``, reward and (bool) terminated, each ``[*batch]``."""
         action = self.task.clip_action(action)
         next_state = self.dynamics.module(state, action)
         reward = self.task.reward(state, action, next_state)

@@ -8,10 +8,10 @@ from phihp_torchrl.integrators.rk4 import RK4
 from phihp_torchrl.integrators.semi_implicit_euler import SemiImplicitEuler
 
 __all__ = [
+    "RK4",
     "Derivative",
     "Dopri5",
     "Integrator",
-    "RK4",
     "SemiImplicitEuler",
     "StateLayout",
     "make_integrator",

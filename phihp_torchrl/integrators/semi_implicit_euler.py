@@ -18,8 +18,8 @@ class SemiImplicitEuler(Integrator):
         q' = q + \Delta t\, (f_q(q, v) + v' - v)
 
     With the kinematics :math:`f_q = v` this is the textbook scheme. Written this way it asks for
-    one evaluation of ``f`` and holds anything learned on top of :math:`f_q` over the step. First-order
-    components take an explicit Euler step.
+    one evaluation of ``f`` and holds anything learned on top of :math:`f_q` over the step.
+    First-order components take an explicit Euler step.
     """
 
     def __call__(

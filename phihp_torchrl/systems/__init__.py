@@ -1,4 +1,4 @@
-"""Physics: the equations that the world and the prior share, and the friction that only the world has."""
+"""Physics: the equations that world and prior share, and the friction that only the world has."""
 
 from __future__ import annotations
 

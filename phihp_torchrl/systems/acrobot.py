@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ class Acrobot(System):
     """
 
     state_names = ("theta1", "theta2", "theta1_dot", "theta2_dot")
-    action_names = ("torque1", "torque2")
+    action_names: ClassVar[tuple[str, ...]] = ("torque1", "torque2")
     angles = ("theta1", "theta2")
     velocity_of = {"theta1": "theta1_dot", "theta2": "theta2_dot"}
     default_constants = {

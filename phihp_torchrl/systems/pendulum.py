@@ -40,5 +40,5 @@ class Pendulum(System):
 
     def identifiable(self, constants: Constants) -> dict[str, Any]:
         """The paper's C_g and C_i: only these two can be told from the motion."""
-        g, m, l = constants["gravity"], constants["mass"], constants["length"]  # noqa: E741
+        g, m, l = constants["gravity"], constants["mass"], constants["length"]
         return {"gravity_gain": 1.5 * g / l, "torque_gain": 3.0 / (m * l**2)}

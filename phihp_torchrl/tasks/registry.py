@@ -25,7 +25,9 @@ def register_task(task: Task, *, replace: bool = False) -> Task:
         True
     """
     if task.name in _TASKS and not replace:
-        raise ValueError(f"task: {task.name!r} is registered already; pass replace=True to replace it.")
+        raise ValueError(
+            f"task: {task.name!r} is registered already; pass replace=True to replace it."
+        )
     _TASKS[task.name] = task
     return task
 
