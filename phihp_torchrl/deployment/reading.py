@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -21,6 +22,7 @@ from phihp_torchrl.deployment.blueprint import (
 from phihp_torchrl.planners.factory import PlannerConfig
 
 MAX_JSON_BYTES = 1_000_000
+_MAX_WEIGHT_BYTES = 1_000_000_000
 _MAX_HEADER_BYTES = 100_000  # what safetensors writes about our few dozen tensors, with room
 
 
@@ -49,11 +51,12 @@ def _read_bytes(path: Path, limit: int) -> bytes:
         raise AgentError(f"{path}: expected this file of a saved agent, found none.")
     try:
         with open(path, "rb") as file:
-            data = file.read(limit + 1)
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size) if size <= limit else b""
     except OSError as error:
         raise AgentError(f"{path}: it can not be read: {error}.") from error
-    if len(data) > limit:
-        raise AgentError(f"{path}: expected at most {limit} bytes, got more.")
+    if size > limit:
+        raise AgentError(f"{path}: expected at most {limit} bytes, got {size}.")
     return data
 
 
@@ -102,7 +105,7 @@ def read_weights(path: Path, expected: Mapping[str, Tensor]) -> tuple[dict[str, 
         expected: tensors of the names, shapes and dtypes that must be there, on the meta device.
     """
     size = sum(tensor.numel() * tensor.element_size() for tensor in expected.values())
-    data = _read_bytes(path, size + _MAX_HEADER_BYTES)
+    data = _read_bytes(path, min(size + _MAX_HEADER_BYTES, _MAX_WEIGHT_BYTES))
     try:
         weights = load_tensors(data)
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError, OverflowError) as error:

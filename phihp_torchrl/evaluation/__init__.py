@@ -1,0 +1,42 @@
+"""What an agent is worth: returns, latency, pictures and tables."""
+
+from __future__ import annotations
+
+from phihp_torchrl.evaluation.episode import Episode, play_episode
+from phihp_torchrl.evaluation.figures import episode_figure, learning_curve
+from phihp_torchrl.evaluation.latency import Latency, measure_latency
+from phihp_torchrl.evaluation.published import PUBLISHED, PUBLISHED_SAMPLES, TARGETS, Published
+from phihp_torchrl.evaluation.returns import (
+    Evaluation,
+    PairedDifference,
+    evaluate,
+    paired_difference,
+)
+from phihp_torchrl.evaluation.seeds import EVALUATION_SEED, check_training_seed, evaluation_seed
+from phihp_torchrl.evaluation.table import TaskResult, markdown_table, mean_and_std, returns_table
+from phihp_torchrl.evaluation.video import write_gif
+
+__all__ = [
+    "EVALUATION_SEED",
+    "PUBLISHED",
+    "PUBLISHED_SAMPLES",
+    "TARGETS",
+    "Episode",
+    "Evaluation",
+    "Latency",
+    "PairedDifference",
+    "Published",
+    "TaskResult",
+    "check_training_seed",
+    "episode_figure",
+    "evaluate",
+    "evaluation_seed",
+    "learning_curve",
+    "markdown_table",
+    "mean_and_std",
+    "measure_latency",
+    "paired_difference",
+    "play_episode",
+    "returns_table",
+    "write_gif",
+]

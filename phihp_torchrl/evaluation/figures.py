@@ -1,0 +1,115 @@
+"""Pictures of what an agent does and how it learned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from phihp_torchrl.evaluation.episode import Episode
+
+# Figures are made without pyplot: no window, no global state, and `savefig` draws with Agg.
+
+
+def episode_figure(episode: Episode) -> Figure:
+    """States, actions and rewards of an episode over time; angles in [-π, π).
+
+    Args:
+        episode: the episode.
+
+    Returns:
+        A figure, one panel a quantity.
+    """
+    task, system = episode.task, episode.task.system
+    panels = len(system.state_names) + len(system.action_names) + 1
+    figure = Figure(figsize=(7.0, 0.6 + 1.1 * panels), layout="constrained")
+    axes = iter(figure.subplots(panels, 1, sharex=True))
+    time = task.time_step * np.arange(len(episode.states))
+    for i, name in enumerate(system.state_names):
+        values, axis = episode.states[:, i], next(axes)
+        if name in system.angles:
+            values = _with_gaps((values + math.pi) % (2 * math.pi) - math.pi)
+            axis.set_yticks([-math.pi, 0, math.pi], ["-π", "0", "π"])
+            axis.set_ylim(-1.1 * math.pi, 1.1 * math.pi)
+        _line(axis, time, values, name, "C0")
+    bounds = zip(system.action_names, task.action_high, strict=True)
+    for i, (name, high) in enumerate(bounds):
+        axis = next(axes)
+        axis.step(time[:-1], episode.actions[:, i], where="post", color="C1", linewidth=1)
+        axis.set_ylim(-1.1 * high, 1.1 * high)
+        _label(axis, name)
+    _line(last := next(axes), time[:-1], episode.rewards, "reward", "C2")
+    last.set_xlabel("time (s)")
+    end = "terminated" if episode.terminated else "ran its time"
+    figure.suptitle(f"{task.name}: return {episode.total_reward:.1f}, {end}")
+    return figure
+
+
+def learning_curve(
+    curves: Mapping[str, Sequence[tuple[ArrayLike, ArrayLike]]],
+    *,
+    title: str = "",
+    xlabel: str = "real environment steps",
+    reference: Mapping[str, float] | None = None,
+) -> Figure:
+    """Return over training: a thin line for each seed and, of several, a thick one for their mean.
+
+    Args:
+        curves: for each method, one ``(steps [k], returns [k])`` for each seed.
+        title: title.
+        xlabel: what the steps are.
+        reference: levels to draw as dashed lines, e.g. published returns.
+
+    Returns:
+        A figure; its steps are on a symlog axis if they span more than a factor of 50.
+    """
+    figure = Figure(figsize=(6.0, 4.0), layout="constrained")
+    axis = figure.subplots()
+    largest, smallest = 0.0, math.inf
+    for i, (method, seeds) in enumerate(curves.items()):
+        color = f"C{i % 10}"
+        runs = [(np.asarray(x, dtype=float), np.asarray(y, dtype=float)) for x, y in seeds]
+        runs = [(x, y) for x, y in runs if len(x)]
+        for x, y in runs:
+            one = len(runs) == 1
+            axis.plot(x, y, color=color, linewidth=2 if one else 0.7, alpha=1 if one else 0.5,
+                      label=method if one else None)  # fmt: skip
+            largest = max(largest, float(x.max()))
+            smallest = min(smallest, *(float(v) for v in x[x > 0]), math.inf)
+        if len(runs) > 1:
+            # Where all seeds have begun and none has ended.
+            grid = np.unique(np.concatenate([x for x, _ in runs]))
+            low, high = max(x[0] for x, _ in runs), min(x[-1] for x, _ in runs)
+            grid = grid[(grid >= low) & (grid <= high)]
+            mean = np.mean([np.interp(grid, x, y) for x, y in runs], axis=0)
+            axis.plot(grid, mean, color=color, linewidth=2, label=f"{method} ({len(runs)} seeds)")
+    for name, level in (reference or {}).items():
+        axis.axhline(level, color="0.4", linestyle="--", linewidth=1, label=name)
+    if largest > 50 * smallest:
+        axis.set_xscale("symlog", linthresh=smallest)
+    axis.set(xlabel=xlabel, ylabel="return", title=title)
+    axis.grid(alpha=0.3)
+    if curves or reference:
+        axis.legend(fontsize="small")
+    return figure
+
+
+def _with_gaps(angle: np.ndarray) -> np.ndarray:
+    """No line across the picture where an angle passes π."""
+    jumps = np.abs(np.diff(angle, prepend=angle[:1])) > math.pi
+    return np.where(jumps, np.nan, angle)
+
+
+def _line(axis: Axes, x: np.ndarray, y: np.ndarray, name: str, color: str) -> None:
+    axis.plot(x, y, color=color, linewidth=1)
+    _label(axis, name)
+
+
+def _label(axis: Axes, name: str) -> None:
+    axis.set_ylabel(name, fontsize="small")
+    axis.tick_params(labelsize="small")
+    axis.grid(alpha=0.3)

@@ -1,0 +1,96 @@
+"""How long one action takes."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+
+from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
+from phihp_torchrl.tasks import Task, get_task
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Milliseconds for an action, over many calls.
+
+    Args:
+        mean: mean.
+        p50: median.
+        p90: 90th percentile.
+        p99: 99th percentile.
+        p99_9: 99.9th percentile.
+        calls: number of calls.
+        threads: intra-op threads of torch meanwhile.
+    """
+
+    mean: float
+    p50: float
+    p90: float
+    p99: float
+    p99_9: float
+    calls: int
+    threads: int
+
+    def summary(self) -> dict[str, float]:
+        """Numbers for a logger or a JSON file."""
+        return {f"latency_ms_{k}": v for k, v in asdict(self).items() if k.startswith(("m", "p"))}
+
+
+def measure_latency(
+    policy: TensorDictModuleBase,
+    task: str | Task,
+    *,
+    calls: int = 1000,
+    warmup: int = 20,
+    seed: int = EVALUATION_SEED,
+    device: torch.device | str | None = None,
+) -> Latency:
+    """Call ``policy`` with one observation at a time, of batch size ``[]``, as a robot would.
+
+    Each call gets another state of the task. The global random state is left as it was.
+
+    Args:
+        policy: reads ``"observation"``, writes ``"action"``.
+        task: a task or the name of a registered one.
+        calls: timed calls; a percentile needs at least as many calls as its last digit counts.
+        warmup: calls before, not timed; compilation happens in them.
+        seed: seed of the states and of the policy's noise.
+        device: where the policy acts.
+
+    Raises:
+        ValueError: if ``calls`` is not positive or ``warmup`` is negative.
+    """
+    if calls < 1:
+        raise ValueError(f"calls: expected a positive number, got {calls}.")
+    if warmup < 0:
+        raise ValueError(f"warmup: expected a number >= 0, got {warmup}.")
+    task = get_task(task) if isinstance(task, str) else task
+    generator = torch.Generator().manual_seed(seed)
+    states = (task.coverage or task.reset).sample([warmup + calls], generator=generator)
+    observations = task.system.observe(states).to(device)
+    cuda = [observations.device] if observations.is_cuda else []
+    milliseconds = []
+    with torch.random.fork_rng(devices=cuda), torch.no_grad():
+        torch.manual_seed(seed)
+        for i, observation in enumerate(observations):
+            is_init = torch.tensor([i == 0], device=observation.device)
+            tensordict = TensorDict(observation=observation, is_init=is_init)
+            start = time.perf_counter()
+            policy(tensordict)
+            if cuda:
+                torch.cuda.synchronize(cuda[0])
+            milliseconds.append(1e3 * (time.perf_counter() - start))
+    times = torch.tensor(milliseconds[warmup:], dtype=torch.float64)
+    return Latency(
+        mean=times.mean().item(),
+        p50=times.quantile(0.5).item(),
+        p90=times.quantile(0.9).item(),
+        p99=times.quantile(0.99).item(),
+        p99_9=times.quantile(0.999).item(),
+        calls=calls,
+        threads=torch.get_num_threads(),
+    )
