@@ -56,7 +56,7 @@ def measure_latency(
     Args:
         policy: reads ``"observation"``, writes ``"action"``.
         task: a task or the name of a registered one.
-        calls: timed calls; a percentile needs at least as many calls as its last digit counts.
+        calls: timed calls; the 99.9th percentile wants a thousand.
         warmup: calls before, not timed; compilation happens in them.
         seed: seed of the states and of the policy's noise.
         device: where the policy acts.
