@@ -51,7 +51,7 @@ class FlatReplay(nn.Module):
 
     def extend(self, batch: Batch) -> None:
         """Add transitions."""
-        capacity = self.rows.shape[0]
+        capacity, count = self.rows.shape[0], len(batch.reward)
         rows = torch.cat(
             [
                 batch.state,
@@ -62,11 +62,11 @@ class FlatReplay(nn.Module):
             ],
             -1,
         )[-capacity:]
-        start = self._written % capacity
+        start = (self._written + count - len(rows)) % capacity
         first = min(len(rows), capacity - start)
         self.rows[start : start + first] = rows[:first]
         self.rows[: len(rows) - first] = rows[first:]
-        self._written += len(rows)
+        self._written += count
         self.cursor.fill_(self._written)
 
     def sample(self, batch_size: int, generator: torch.Generator | None = None) -> Batch:

@@ -85,13 +85,20 @@ def fit(
         generator: source of mini-batches.
 
     Raises:
-        ValueError: if there are no transitions, or some are not finite.
+        ValueError: if there are no transitions, or some are not finite; and for Levenberg-Marquardt
+            with an integrator that chooses its own steps, which it cannot differentiate row by row.
     """
     for name, data in (("train", train), ("held_out", held_out)):
         if data.numel() == 0:
             raise ValueError(f"{name}: expected at least one transition, got none.")
-        if not all(part.isfinite().all() for part in loss.transitions(data)):
+        # As given, for an angle is found even of infinite cosines and sines.
+        if not all(data.get(key).isfinite().all() for key in loss.in_keys):
             raise ValueError(f"{name}: expected finite transitions, got some that are not.")
+    if config.method == "levenberg_marquardt" and not loss.dynamics.integrator.compiles:
+        raise ValueError(
+            "method: expected 'adam' for a model that is integrated by "
+            f"{type(loss.dynamics.integrator).__name__}, got {config.method!r}."
+        )
     start = time.perf_counter()
     if config.scaled:
         loss.set_scales(train)
@@ -154,7 +161,11 @@ def _levenberg_marquardt(
     damping = 1e-2
     growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
     loss.lambda_.fill_(config.initial_lambda)
-    best, best_error, stale, steps = theta, math.inf, 0, 0
+    # The start competes too: a fit goes on from a model that may be hard to beat.
+    best, best_error = theta, system.prediction_error(theta, reference)
+    if not math.isfinite(best_error):
+        best_error = math.inf
+    stale, steps = 0, 0
     while steps < config.steps:
         steps += 1
         rows: tuple[Tensor, ...] = data

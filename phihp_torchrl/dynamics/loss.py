@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
 from phihp_torchrl.dynamics.hybrid import HybridDynamics
+from phihp_torchrl.dynamics.residual import spread
 
 
 class DynamicsLoss(LossModule):
@@ -82,7 +83,7 @@ class DynamicsLoss(LossModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         keys = self.tensor_keys
-        return [keys.observation, keys.action, ("next", keys.observation)]
+        return [keys.observation, keys.action, unravel_key(("next", keys.observation))]
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:  # type: ignore[no-untyped-def]
         """This loss has no value estimator."""
@@ -139,7 +140,7 @@ class DynamicsLoss(LossModule):
         state, action, next_state = self.transitions(tensordict.reshape(-1))
         task = self.dynamics.task
         rate = task.system.difference(next_state, state) / task.time_step
-        size = rate.std(0).clamp_min(1e-3)
+        size = spread(rate)
         self.error_scale.copy_(size * task.time_step)
         self.residual_scale.copy_(size)
         set_scales = getattr(self.dynamics.residual, "set_scales", None)

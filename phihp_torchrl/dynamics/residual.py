@@ -74,5 +74,9 @@ class ResidualMLP(nn.Module):
         """
         inputs = torch.cat([self.system.observe(state), action], -1)
         self.input_scale.copy_(inputs.square().mean(0).sqrt().clamp_min(1e-3).reciprocal())
-        size = derivative[:, list(self.outputs)].std(0)
-        self.output_scale.copy_(size.clamp_min(1e-3))
+        self.output_scale.copy_(spread(derivative[:, list(self.outputs)]))
+
+
+def spread(values: Tensor) -> Tensor:
+    """Standard deviation ``[k]`` of the columns of ``values`` ``[N, k]``, at least 1e-3."""
+    return values.std(0, correction=min(1, len(values) - 1)).clamp_min(1e-3)  # of one row, zero
