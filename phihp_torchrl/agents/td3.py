@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -42,7 +41,12 @@ class TD3Config:
     value_expansion: int = 1
 
     def __post_init__(self) -> None:
-        positive = ("actor_learning_rate", "critic_learning_rate", "policy_delay", "value_expansion")
+        positive = (
+            "actor_learning_rate",
+            "critic_learning_rate",
+            "policy_delay",
+            "value_expansion",
+        )
         for name in positive:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
@@ -74,9 +78,9 @@ def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
 class TD3Update(nn.Module):
     """``policy_delay`` critic updates, one actor update and the soft updates, as one graph.
 
-    The tensors it changes are those of a :class:`~torchrl.objectives.TD3Loss`, which stays the owner of
-    parameters and targets: checkpoints, planners and stock TorchRL code read them there. The moments of
-    Adam are buffers of this module.
+    The tensors it changes are those of a :class:`~torchrl.objectives.TD3Loss`, which stays the
+    owner of parameters and targets: checkpoints, planners and stock TorchRL code read them there.
+    The moments of Adam are buffers of this module.
 
     Args:
         loss: whose parameters to train.
@@ -95,9 +99,11 @@ class TD3Update(nn.Module):
         >>> action = torch.zeros(64, 1)
         >>> next_state, reward, terminated = model.transition(state, action)
         >>> batch = Batch(state, action, reward, next_state, terminated)
-        >>> sorted(update([batch] * config.policy_delay))
+        >>> sorted(update(batch))
         ['loss_actor', 'loss_qvalue']
     """
+
+    steps: Tensor
 
     def __init__(
         self,
@@ -137,37 +143,36 @@ class TD3Update(nn.Module):
     @torch.no_grad()
     def forward(
         self,
-        batches: Sequence[Batch],
+        batch: Batch,
         learning_rate_scale: float = 1.0,
         generator: torch.Generator | None = None,
     ) -> dict[str, Tensor]:
-        """Train on ``policy_delay`` batches.
+        """Train on ``policy_delay`` batches of equal size, given as one.
 
         Args:
-            batches: one batch for each critic update; the actor learns from the last.
+            batch: transitions, ``[policy_delay * N]`` rows: ``N`` for each critic update, of which the
+                last also serve the actor's.
             learning_rate_scale: factor on both learning rates.
             generator: source of the target policy's noise.
 
         Returns:
             ``loss_qvalue`` and ``loss_actor``, detached scalars.
+
+        Raises:
+            ValueError: if the rows do not divide by ``policy_delay``.
         """
-        if len(batches) != self.config.policy_delay:
+        config, rows = self.config, len(batch.reward)
+        if rows == 0 or rows % config.policy_delay:
             raise ValueError(
-                f"batches: expected policy_delay = {self.config.policy_delay}, got {len(batches)}."
+                f"batch: expected a multiple of policy_delay = {config.policy_delay} rows, got {rows}."
             )
         high = self.loss.max_action
-        noises = []
-        for batch in batches:
-            noise = self.config.target_noise * torch.randn(
-                batch.action.shape, generator=generator, device=high.device
-            )
-            clip = self.config.target_noise_clip
-            noises.append(noise.clamp(-clip, clip) * high)
-        scale = torch.tensor(learning_rate_scale, dtype=torch.float32, device=high.device)
+        noise = torch.randn(batch.action.shape, generator=generator, device=high.device)
+        clip = config.target_noise_clip
         loss_qvalue, loss_actor = self._compiled_step(
-            tuple(batches),
-            tuple(noises),
-            scale,
+            batch,
+            (config.target_noise * noise).clamp(-clip, clip) * high,
+            torch.tensor(learning_rate_scale, dtype=torch.float32, device=high.device),
             self.steps,
             self.actor,
             self.critics,
@@ -182,8 +187,8 @@ class TD3Update(nn.Module):
 
     def _step(
         self,
-        batches: tuple[Batch, ...],
-        noises: tuple[Tensor, ...],
+        batch: Batch,
+        noise: Tensor,
         scale: Tensor,
         steps: Tensor,
         actor: list[Tensor],
@@ -196,24 +201,26 @@ class TD3Update(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         config, observe = self.config, self.world_model.observe
         steps = steps.to(torch.float32)
-        for i, (batch, noise) in enumerate(zip(batches, noises, strict=True)):
-            target = td3_target(
-                batch,
-                target_actor,
-                target_critics,
-                noise,
-                high,
-                config.gamma,
-                observe,
-                self.world_model.transition,
-                config.value_expansion,
-            )
-            observation = observe(batch.state)
+        # The targets stand still until the soft update, so all batches share one pass for them.
+        target = td3_target(
+            batch,
+            target_actor,
+            target_critics,
+            noise,
+            high,
+            config.gamma,
+            observe,
+            self.world_model.transition,
+            config.value_expansion,
+        )
+        parts = (part.chunk(config.policy_delay) for part in (batch.state, batch.action, target))
+        for i, (state, action, value) in enumerate(zip(*parts, strict=True)):
+            observation = observe(state)
             gradients, loss_qvalue = torch.func.grad_and_value(critic_loss)(
-                critics, observation, batch.action, target, high
+                critics, observation, action, value, high
             )
-            rate = scale * config.critic_learning_rate
             count = steps * config.policy_delay + (i + 1)
+            rate = scale * config.critic_learning_rate
             adam_(critics, gradients, *critic_moments, count, rate)
         gradients, loss_actor = torch.func.grad_and_value(actor_loss)(
             actor, critics, observation, high

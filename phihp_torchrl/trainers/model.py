@@ -69,7 +69,8 @@ class ModelConfig:
 
     Args:
         real_steps: real transitions in all.
-        steps_per_iteration: real transitions between two fits, T.
+        steps_per_iteration: real transitions between two fits, T; ``None`` for a tenth of all of them,
+            but no fewer than 50.
         kind: ``"hybrid"``, ``"data_driven"``, ``"prior"`` or ``"oracle"``.
         constants_error: relative error of the prior's first guess, signs drawn by the seed.
         hidden_sizes: widths of the residual's hidden layers.
@@ -78,13 +79,15 @@ class ModelConfig:
         integrator: of the model.
         lambda_0: initial weight λ of the published loss.
         tau_ph: its growth.
-        warm_start: whether a fit starts from the one before.
+        warm_start: whether a fit between the first and the last starts from the one before, with
+            λ where that ended, and takes at most ``refit_steps``.
+        refit_steps: see ``warm_start``.
         fit: how to fit.
         collect: how to collect.
     """
 
     real_steps: int = 5000
-    steps_per_iteration: int = 500
+    steps_per_iteration: int | None = None
     kind: str = "hybrid"
     constants_error: float = 0.3
     hidden_sizes: tuple[int, ...] = (16, 16)
@@ -94,13 +97,15 @@ class ModelConfig:
     lambda_0: float = 1e3
     tau_ph: float = 1e3
     warm_start: bool = True
+    refit_steps: int = 15
     fit: FitConfig = field(default_factory=FitConfig)
     collect: CollectConfig = field(default_factory=CollectConfig)
 
     def __post_init__(self) -> None:
-        for name in ("real_steps", "steps_per_iteration"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        for name in ("real_steps", "steps_per_iteration", "refit_steps"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name}: expected a positive number, got {value}.")
         if self.kind not in ("hybrid", "data_driven", "prior", "oracle"):
             raise ValueError(
                 f"kind: expected 'hybrid', 'data_driven', 'prior' or 'oracle', got {self.kind!r}."
@@ -109,6 +114,16 @@ class ModelConfig:
             raise ValueError(
                 f"activation: expected one of {sorted(_ACTIVATIONS)}, got {self.activation!r}."
             )
+
+    @property
+    def period(self) -> int:
+        """Real transitions between two fits, T."""
+        return self.steps_per_iteration or max(50, -(-self.real_steps // 10))
+
+    @property
+    def iterations(self) -> int:
+        """Number of fits."""
+        return -(-self.real_steps // self.period)
 
 
 def make_dynamics(
@@ -197,7 +212,7 @@ class ModelTrainer:
 
     def advance(self) -> dict[str, float]:
         """Collect once and fit once; returns what to log."""
-        steps = min(self.config.steps_per_iteration, self.config.real_steps - self.real_steps)
+        steps = min(self.config.period, self.config.real_steps - self.real_steps)
         new = self.collect(steps)
         self.data = new if self.data is None else torch.cat([self.data, new])
         self.iteration += 1
@@ -227,11 +242,18 @@ class ModelTrainer:
 
     def fit(self) -> dict[str, Tensor | float]:
         """Fit the model to all data and measure it."""
+        config = self.config.fit
         if not self.config.warm_start:
             self.dynamics.load_state_dict(self._initial)
             self.loss.lambda_.fill_(self.config.lambda_0)
+        elif self.iteration > 1 and not self.done:
+            config = replace(
+                config,
+                steps=min(config.steps, self.config.refit_steps),
+                initial_lambda=config.final_lambda,
+            )
         train, held_out, blocks = split(self.data)
-        report = fit(self.loss, train, held_out, self.config.fit, self.generator)
+        report = fit(self.loss, train, held_out, config, self.generator)
         state, action, _ = self.loss.transitions(train)
         metrics: dict[str, Tensor | float] = {
             "model/train_error": report.train_error,
@@ -304,8 +326,7 @@ class ModelTrainer:
             generator=self.generator,
         )
         high = torch.tensor(task.action_high)
-        iterations = -(-self.config.real_steps // self.config.steps_per_iteration)
-        fade = max(0.0, 1.0 - (self.iteration - 1) / max(1, iterations - 2))
+        fade = max(0.0, 1.0 - (self.iteration - 1) / max(1, self.config.iterations - 2))
 
         def policy(tensordict: TensorDictBase) -> TensorDictBase:
             if tensordict["step_count"].item() == 0:
