@@ -89,7 +89,7 @@ def fit(
             with an integrator that chooses its own steps, which it cannot differentiate row by row.
     """
     for name, data in (("train", train), ("held_out", held_out)):
-        if data.numel() == 0:
+        if data.batch_size.numel() == 0:  # numel of a tensordict is never below 1
             raise ValueError(f"{name}: expected at least one transition, got none.")
         # As given, for an angle is found even of infinite cosines and sines.
         if not all(data.get(key).isfinite().all() for key in loss.in_keys):
