@@ -34,6 +34,8 @@ def main(arguments: list[str]) -> None:
         result = run(request.config, request.path, resume=request.resume)
     except (HydraException, ConfigError, CheckpointError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
     report(result)
     OUTPUT.mkdir(parents=True, exist_ok=True)
     for source in sorted(result.path.glob("episode.*")):

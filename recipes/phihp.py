@@ -26,6 +26,8 @@ def main(composed: DictConfig) -> None:
         result = run(request.config, request.path, resume=request.resume)
     except (ConfigError, CheckpointError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
     report(result)
 
 

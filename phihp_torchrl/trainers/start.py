@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from phihp_torchrl.trainers.checkpoints import load_state, rotation_paths
+from phihp_torchrl.trainers.checkpoints import load_state
 from phihp_torchrl.trainers.config import ConfigError, differences, from_mapping, to_mapping
 from phihp_torchrl.trainers.run_config import FREE_KEYS, PHASES, RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
@@ -26,8 +26,10 @@ def start_directory(config: RunConfig, path: str | Path | None) -> tuple[RunConf
     if path is None:
         path = new_run_directory(config.task, config.preset, config.seed)
     directory = RunDirectory(path, config.keep_checkpoints)
-    if directory.config.exists() or rotation_paths(directory.rotation):
+    if directory.config.exists():
         raise ConfigError(f"run_dir: {path} holds a run already; go on with resume={path}.")
+    if directory.path.exists() and (not directory.path.is_dir() or any(directory.path.iterdir())):
+        raise ConfigError(f"run_dir: expected an empty or new directory, {path} is not.")
     directory.path.mkdir(parents=True, exist_ok=True)
     if config.start_from is not None:
         source = RunDirectory(config.start_from)

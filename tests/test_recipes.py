@@ -1,0 +1,139 @@
+"""The recipes, run small from end to end."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from phihp_torchrl.deployment import load_agent
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+SMALL = (
+    "progress=false",
+    "model.real_steps=60",
+    "model.steps_per_iteration=30",
+    "model.fit.steps=2",
+    "model.collect.planning_horizon=3",
+    "model.collect.replan_every=2",
+    "model.collect.num_candidates=8",
+    "model.collect.top_k=2",
+    "model.collect.optim_steps=1",
+    "policy.updates=8",
+    "policy.batch_size=8",
+    "policy.num_worlds=4",
+    "policy.chunk_steps=2",
+    "policy.updates_per_step=2",
+    "policy.replay_capacity=200",
+    "policy.random_steps=16",
+    "policy.evaluation_interval=4",
+    "policy.evaluation_episodes=2",
+    "policy.evaluation_steps=20",
+    "policy.td3.actor_hidden_sizes=[8]",
+    "policy.td3.critic_hidden_sizes=[8]",
+    "planner.planning_horizon=2",
+    "planner.replan_every=2",
+    "planner.optim_steps=1",
+    "planner.num_candidates=8",
+    "planner.num_policy_candidates=2",
+    "planner.top_k=2",
+    "evaluate.episodes=2",
+    "evaluate.latency_actions=3",
+)
+
+Recipe = Callable[..., None]
+
+
+@pytest.fixture
+def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Recipe:
+    """Run a recipe as ``python recipes/<name>.py <arguments>`` would, in an empty directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(RECIPES))
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+    def run(name: str, *arguments: str) -> None:
+        path = str(RECIPES / f"{name}.py")
+        monkeypatch.setattr(sys, "argv", [path, *arguments])
+        runpy.run_path(path, run_name="__main__")
+
+    return run
+
+
+@pytest.mark.slow
+def test_phihp_then_resume_then_evaluate(
+    recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained = tmp_path / "run"
+    recipe("phihp", "task=pendulum", f"run_dir={trained}", *SMALL)
+    assert "| pendulum | 1 | 60 |" in capsys.readouterr().out
+    assert (trained / "episode.gif").stat().st_size > 0
+    assert not (tmp_path / "outputs").exists()
+    # A finished run has nothing to resume; its settings are its own, whatever the defaults.
+    recipe("phihp", f"resume={trained}")
+    with pytest.raises(SystemExit, match="task: 'acrobot', not 'pendulum'"):
+        recipe("phihp", f"resume={trained}", "task=acrobot")
+    with pytest.raises(SystemExit, match=r"policy\.updates: 9, not 8"):
+        recipe("phihp", f"resume={trained}", "policy.updates=9")
+    recipe("phihp", f"resume={trained}", "logger=tensorboard", "checkpoint_interval=1")
+
+    capsys.readouterr()
+    shutil.copytree(trained / "agent", tmp_path / "agent")
+    small = ("episodes=2", "latency_actions=3")
+    recipe("evaluate", "agent=agent", *small)
+    assert "| pendulum | planner | actor |" in capsys.readouterr().out
+    results = json.loads((tmp_path / "agent" / "evaluation.json").read_text())
+    assert results.keys() == {"planner", "actor"}
+    assert len(results["actor"]["returns"]) == 2
+    assert (tmp_path / "agent" / "episode.png").exists()
+    assert (tmp_path / "agent" / "episode.gif").exists()
+    # What the run itself found: the same seeds, so the same returns.
+    during = json.loads((trained / "evaluation.json").read_text())
+    assert during["planner"]["returns"] == results["planner"]["returns"]
+    load_agent(tmp_path / "agent")  # what the recipe writes beside it does no harm
+
+    recipe("evaluate", "agent=agent", "planner=false", "out_dir=there", "video=false", *small)
+    assert json.loads((tmp_path / "there" / "evaluation.json").read_text()).keys() == {"actor"}
+    assert not (tmp_path / "there" / "episode.gif").exists()
+
+
+@pytest.mark.slow
+def test_the_demo_trains_and_shows(
+    recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe("demo", *SMALL)
+    assert "| pendulum-swingup | 1 | 60 |" in capsys.readouterr().out
+    assert {p.name for p in (tmp_path / "outputs" / "demo").iterdir()} == {
+        "episode.png",
+        "episode.gif",
+    }
+    assert len(list((tmp_path / "outputs" / "pendulum-swingup").iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("phihp", ["seed=-1"], "error: seed: expected"),
+        ("phihp", ["+policy.td3.gama=1"], r"error: policy\.td3\.gama: unknown key"),
+        ("phihp", ["phases=[evaluate]", "from=nowhere"], "error: nowhere: not the directory"),
+        ("phihp", ["resume=nowhere"], "error: nowhere: not the directory"),
+        ("phihp", ["plugins=[nowhere.py]"], r"error: plugins: nowhere\.py"),
+        ("evaluate", [], "error: agent: expected the directory"),
+        ("evaluate", ["agent=nowhere"], "error: nowhere: expected the directory"),
+        ("evaluate", ["agent=nowhere", "planner=maybe"], "error: planner: expected true, false"),
+        ("evaluate", ["agent=nowhere", "episodes=0"], "error: episodes: expected a positive"),
+        ("evaluate", ["agent=nowhere", "+speed=3"], "error: speed: unknown key"),
+        ("demo", ["seed=-1"], "error: seed: expected"),
+        ("demo", ["sead=1"], "error: .*sead"),
+    ],
+)
+def test_a_wrong_argument_is_one_sentence_and_no_step(
+    recipe: Recipe, tmp_path: Path, name: str, arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit, match=f"(?s)^{message}"):
+        recipe(name, *arguments)
+    assert not list(tmp_path.rglob("*.csv"))
