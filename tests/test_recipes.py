@@ -16,6 +16,7 @@ from phihp_torchrl.deployment import load_agent
 RECIPES = Path(__file__).parents[1] / "recipes"
 SMALL = (
     "progress=false",
+    "compile=false",
     "model.real_steps=60",
     "model.steps_per_iteration=30",
     "model.fit.steps=2",

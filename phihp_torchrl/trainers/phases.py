@@ -158,7 +158,6 @@ def make_phase(
         actor=policy.best_actor(),
         qvalue=policy.best_qvalue(),
         planner_config=config.planner,
-        compile=config.compile,
     )
     return EvaluatePhase(agent, config, directory)
 
