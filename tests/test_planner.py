@@ -320,6 +320,58 @@ def test_a_broken_actor_does_no_harm():
     torch.testing.assert_close(found.actions, bounds().center.expand(4, 2))
 
 
+def test_bad_elites_do_not_enter_the_mean():
+    """Hardly any candidate is good, so most of the elites are bad."""
+
+    def reward(state, action, reward):
+        return torch.where(action[..., 0] > 0.8, reward, nan)
+
+    s = settings(planning_horizon=1, top_k=20, optim_steps=1)
+    found = plan(ZEROS, draw(s), problem=point_problem(reward=reward), settings=s)
+    assert found.score.isfinite()
+    assert found.actions[0, 0] > 0.8
+
+
+def test_a_sequence_that_is_not_finite_never_wins():
+    """Not even where the model makes something of it."""
+
+    class Forgiving(Point):
+        def transition(self, state, action):
+            return super().transition(state, action.nan_to_num(0.3))
+
+    problem = Problem(Forgiving(), bounds(), lambda observation: observation * nan)
+    s = settings(num_policy_candidates=20, select="best")
+    assert plan(ZEROS, draw(s), problem=problem, settings=s).actions.isfinite().all()
+
+
+def test_between_two_bad_ones_the_best_candidate_wins():
+    """The actor's own action and the mean of the elites are both where nothing is known."""
+
+    def reward(state, action, reward):
+        return torch.where(action[..., 0].abs() > 0.5, reward, nan)
+
+    s = settings(
+        planning_horizon=1, optim_steps=1, num_candidates=3, top_k=2, num_policy_candidates=1
+    )
+    noise = torch.tensor([[0.0, 0.0], [0.9, 0.0], [-0.9, 0.0]], dtype=torch.float64)
+    problem = point_problem(torch.zeros_like, goal=0.3, reward=reward)
+    found = plan(ZEROS, noise.reshape(1, 1, 3, 2), problem=problem, settings=s)
+    torch.testing.assert_close(found.actions[0, 0].item(), 0.9)
+    assert found.score.isfinite()
+
+
+def test_the_actors_own_sequence_competes_once(monkeypatch):
+    """Were the best of all counted twice, two elites would be one and the spread would vanish."""
+    seen = spy_on_scores(monkeypatch)
+    s = settings(
+        planning_horizon=1, top_k=2, num_policy_candidates=1, num_kept_elites=1, num_candidates=20
+    )
+    perfect = point_problem(lambda observation: 0.3 - observation)
+    plan(ZEROS, draw(s), problem=perfect, settings=s)
+    third_iteration = seen[2][0]
+    assert third_iteration.std(1).min() > 1e-6
+
+
 def test_one_bad_row_of_a_batch_leaves_the_others_alone():
     def reward(state, action, reward):
         return torch.where(state[..., 0] > 50, nan, reward)
@@ -581,6 +633,18 @@ def test_a_copy_has_modules_of_its_own():
             parameter.fill_(10.0)
     assert not torch.equal(other.plan(tensordict, noise).score, before)
     assert torch.equal(planner.plan(tensordict, noise).score, before)
+
+
+def test_an_actor_may_read_the_models_state():
+    """Then the environment is stepped, and needs the state."""
+    task, env, _, _ = task_parts("pendulum")
+    actor = TensorDictModule(nn.Linear(2, 1), ["state"], ["action"])
+    planner = make_planner(env, actor)
+    assert not planner.uses_tensors
+    assert planner.in_keys == ["observation", "state"]
+    assert env.rollout(3, planner)["action"].shape == (3, 1)
+    with pytest.raises(ValueError, match="state: expected a tensor"):
+        planner(TensorDict(observation=task.system.observe(torch.zeros(2))))
 
 
 # Several steps of one plan.
@@ -882,8 +946,11 @@ def test_modules_that_are_missing_or_do_not_fit():
     with pytest.raises(ValueError, match="got 'tensor', but PendulumEnv has no tensor_model"):
         make_planner(PendulumEnv(), backend="tensor")
     latent = TensorDictModule(nn.Linear(2, 1), ["state"], ["action"])
-    with pytest.raises(ValueError, match=r"got 'tensor', but actor reads \['state'\]"):
+    with pytest.raises(ValueError, match=r"got 'tensor', but actor or qvalue read \['state'\]"):
         make_planner(env, latent, backend="tensor")
+    unseen = TensorDictModule(nn.Linear(2, 1), ["pixels"], ["action"])
+    with pytest.raises(ValueError, match=r"actor: expected in_keys among .*, got \['pixels'\]"):
+        make_planner(env, unseen)
 
 
 def test_environments_that_cannot_be_planned_on():

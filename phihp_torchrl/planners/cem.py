@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,15 +11,22 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MPCPlannerBase
 
 from phihp_torchrl.planners.core import Plan, plan
-from phihp_torchrl.planners.functions import EnvModel, smallest, tensor_function
+from phihp_torchrl.planners.env_model import (
+    EnvModel,
+    find_action,
+    find_done,
+    find_limits,
+    find_reward,
+    find_situation,
+)
+from phihp_torchrl.planners.functions import actor_function, value_function
 from phihp_torchrl.planners.memory import PlanMemory
-from phihp_torchrl.planners.scoring import ActionBounds, Problem
+from phihp_torchrl.planners.scoring import ActionBounds, Problem, TensorModel
 from phihp_torchrl.planners.settings import PlanSettings
 
 _logger = logging.getLogger(__name__)
@@ -158,62 +165,30 @@ class CEMPlanner(MPCPlannerBase):
             actor_margin=actor_margin,
         )
         action_key, reward_key = unravel_key(action_key), unravel_key(reward_key)
-        action_spec = _action_spec(env, action_key)
+        action_spec = find_action(env, action_key)
         super().__init__(env, action_key=action_key)
         self.action_spec = action_spec
         self.settings = settings
-        self.action_key, self.reward_key = action_key, reward_key
+        self.action_key, self.reward_key = action_key, find_reward(env, reward_key)
         self.value_key, self.is_init_key = unravel_key(value_key), unravel_key(is_init_key)
-        self.default_done_keys = done_keys is None
-        self.done_keys = _done_keys(env, done_keys)
-        self.observation_key = _observation_key(env, observation_key)
+        self.done_keys = find_done(env, done_keys)
+        situation = find_situation(env)
+        self.observation_key = _choose(situation, observation_key)
         self.actor, self.qvalue = actor, qvalue
         self.generator = generator
-        self._check_modules()
-        _check_reward(env, reward_key)
-
-        low, high = _limits(action_spec)
-        for name, tensor in (("low", low), ("high", high)):
-            self.register_buffer(f"_action_{name}", tensor, persistent=False)
-
-        if warm_start and num_policy_candidates == num_candidates:
-            raise ValueError(
-                "warm_start: expected random candidates to start from the previous plan, got "
-                f"num_policy_candidates={num_policy_candidates} of num_candidates={num_candidates}."
-            )
-        if isinstance(replan_every, bool) or not isinstance(replan_every, int):
-            raise ValueError(f"replan_every: expected an integer, got {replan_every!r}.")
-        if not 1 <= replan_every <= planning_horizon:
-            raise ValueError(
-                f"replan_every: expected 1 to planning_horizon={planning_horizon}, "
-                f"got {replan_every}."
-            )
-        stateless = replan_every == 1 and not warm_start
-        self.memory = None if stateless else PlanMemory(replan_every, warm_start)
-
-        reason = self._why_not_tensors()
-        if backend not in ("auto", "tensor", "env"):
-            raise ValueError(f"backend: expected 'auto', 'tensor' or 'env', got {backend!r}.")
-        if backend == "tensor" and reason:
-            raise ValueError(f"backend: expected 'env' or 'auto', got 'tensor', but {reason}.")
-        self.uses_tensors = backend != "env" and not reason
+        self._check_modules(situation)
+        low, high = find_limits(action_spec)
+        self.register_buffer("_action_low", low, persistent=False)
+        self.register_buffer("_action_high", high, persistent=False)
+        self.memory = self._make_memory(replan_every, warm_start)
+        self._choose_backend(backend, done_keys is None, bool(compile))
+        # A tensor model finds the state from one observation, on either path.
+        self.in_keys = list(situation)
+        if self._has_tensor_model() and self.observation_key is not None:
+            self.in_keys = list(dict.fromkeys([self.observation_key, *self._module_keys()]))
+        self._expected = {key: situation[key] for key in self.in_keys}
         self._compile = compile
         self._planning_function: Callable[..., Plan] | None = None
-        if not self.uses_tensors:
-            level = logging.WARNING if compile else logging.INFO
-            _logger.log(
-                level,
-                "CEMPlanner steps the environment%s: %s.",
-                ", which is not compiled" if compile else "",
-                reason or "backend='env'",
-            )
-        if not self._has_tensor_model():
-            batch_size = tuple(env.batch_size)
-            if batch_size:
-                raise ValueError(f"env: expected batch size [], got {list(batch_size)}.")
-        if self.uses_tensors or self._has_tensor_model():
-            self.in_keys = [self.observation_key]
-        self._checked = _specs(env, self.in_keys)
 
     # Construction: what fits together.
 
@@ -224,23 +199,59 @@ class CEMPlanner(MPCPlannerBase):
             and getattr(self.env, "tensor_model", None) is not None
         )
 
-    def _why_not_tensors(self) -> str | None:
+    def _module_keys(self) -> list[NestedKey]:
+        """What actor and critics read besides the action."""
+        modules = [module for module in (self.actor, self.qvalue) if module is not None]
+        keys = [unravel_key(key) for module in modules for key in module.in_keys]
+        return [key for key in keys if key != self.action_key]
+
+    def _why_not_tensors(self, default_done_keys: bool) -> str | None:
         """Why the environment must be stepped, if so."""
         if not self._has_tensor_model():
             return f"{type(self.env).__name__} has no tensor_model of its own"
         if self.observation_key is None:
-            return "the environment has several observations and observation_key says not which"
-        if self.reward_key != ("next", "reward") or not self.default_done_keys:
-            return "reward_key or done_keys are not those of the tensor model"
-        if len(self.action_spec.shape) != 1:
-            return f"actions of shape {list(self.action_spec.shape)} are not vectors"
-        known = {self.observation_key, self.action_key}
-        for name, module in (("actor", self.actor), ("qvalue", self.qvalue)):
-            if module is not None and not set(module.in_keys) <= known:
-                return f"{name} reads {module.in_keys}, not only {self.observation_key!r}"
+            return "it has several observations and observation_key does not say which to take"
+        if self.reward_key != ("next", "reward") or not default_done_keys:
+            return "reward_key or done_keys are not those of its tensor_model"
+        if others := set(self._module_keys()) - {self.observation_key}:
+            return f"actor or qvalue read {sorted(others, key=str)}, not {self.observation_key!r}"
         return None
 
-    def _check_modules(self) -> None:
+    def _choose_backend(self, backend: str, default_done_keys: bool, compile: bool) -> None:
+        if backend not in ("auto", "tensor", "env"):
+            raise ValueError(f"backend: expected 'auto', 'tensor' or 'env', got {backend!r}.")
+        reason = self._why_not_tensors(default_done_keys)
+        if backend == "tensor" and reason:
+            raise ValueError(f"backend: expected 'env' or 'auto', got 'tensor', but {reason}.")
+        if self.env.batch_size and not self._has_tensor_model():
+            raise ValueError(f"env: expected batch size [], got {list(self.env.batch_size)}.")
+        self.uses_tensors = backend != "env" and not reason
+        if not self.uses_tensors:
+            _logger.log(
+                logging.WARNING if compile else logging.INFO,
+                "CEMPlanner steps the environment%s: %s.",
+                ", which is not compiled" if compile else "",
+                reason or "backend='env'",
+            )
+
+    def _make_memory(self, replan_every: int, warm_start: bool) -> PlanMemory | None:
+        s = self.settings
+        if isinstance(replan_every, bool) or not isinstance(replan_every, int):
+            raise ValueError(f"replan_every: expected an integer, got {replan_every!r}.")
+        if not 1 <= replan_every <= s.planning_horizon:
+            raise ValueError(
+                f"replan_every: expected 1 to planning_horizon={s.planning_horizon}, "
+                f"got {replan_every}."
+            )
+        if warm_start and s.num_policy_candidates == s.num_candidates:
+            raise ValueError(
+                "warm_start: expected random candidates to start from the previous plan, got "
+                f"num_policy_candidates=num_candidates={s.num_candidates}."
+            )
+        needed = replan_every > 1 or warm_start
+        return PlanMemory(replan_every, warm_start) if needed else None
+
+    def _check_modules(self, situation: Collection[NestedKey]) -> None:
         actor, qvalue = self.actor, self.qvalue
         if actor is None and self.settings.num_policy_candidates:
             raise ValueError(
@@ -249,60 +260,39 @@ class CEMPlanner(MPCPlannerBase):
             )
         if actor is None and qvalue is not None:
             raise ValueError(
-                "actor: expected a module to act beyond the horizon for qvalue, got None."
+                "actor: expected a module to act beyond the horizon, for qvalue, got None."
             )
         for name, module, key in (
             ("actor", actor, self.action_key),
             ("qvalue", qvalue, self.value_key),
         ):
-            if module is not None and key not in (keys := getattr(module, "out_keys", [])):
+            if module is None:
+                continue
+            if key not in (keys := getattr(module, "out_keys", [])):
                 raise ValueError(
                     f"{name}: expected a TensorDict module that writes {key!r}, "
                     f"got {type(module).__name__} that writes {list(keys)}."
                 )
-        if actor is not None and self.action_key in actor.in_keys:
-            raise ValueError(f"actor: expected no {self.action_key!r} among its in_keys.")
+            allowed = [*situation, *([self.action_key] if module is qvalue else [])]
+            if unknown := [k for k in module.in_keys if unravel_key(k) not in allowed]:
+                raise ValueError(f"{name}: expected in_keys among {allowed}, got {unknown}.")
 
     def _build(self) -> Callable[..., Plan]:
-        """The plan as a function of observation, noise and mean. Not kept in copies."""
+        """The plan as a function of observation, noise and mean."""
         action_shape = self.action_spec.shape
-        action_dim = self._action_low.numel()
         if self.uses_tensors:
-            model: Any = self.env.tensor_model
+            model: TensorModel = self.env.tensor_model
         else:
             model = EnvModel(
                 self.env, self.action_key, action_shape, self.reward_key, self.done_keys
             )
-
-        def read(observation: Any, key: NestedKey) -> Tensor:
-            return observation if isinstance(observation, Tensor) else observation.get(key)
-
-        act = value = None
+        actor = value = None
         if self.actor is not None:
-            actor_keys = list(self.actor.in_keys)
-            actor_function = tensor_function(self.actor, self.action_key)
-
-            def act(observation: Any) -> Tensor:
-                action = actor_function(*(read(observation, key) for key in actor_keys))
-                return action.reshape(-1, action_dim)
-
+            actor = actor_function(self.actor, self.action_key, action_shape.numel())
         if self.qvalue is not None:
-            value_keys, action_key = list(self.qvalue.in_keys), self.action_key
-            value_function = tensor_function(self.qvalue, self.value_key)
-
-            def value(observation: Any, action: Tensor) -> Tensor:
-                action = action.reshape(-1, *action_shape)
-                return smallest(
-                    value_function(
-                        *(
-                            action if key == action_key else read(observation, key)
-                            for key in value_keys
-                        )
-                    )
-                )
-
+            value = value_function(self.qvalue, self.value_key, self.action_key, action_shape)
         bounds = ActionBounds.from_limits(self._action_low, self._action_high)
-        problem = Problem(model=model, bounds=bounds, actor=act, value=value)
+        problem = Problem(model=model, bounds=bounds, actor=actor, value=value)
         function = partial(plan, problem=problem, settings=self.settings)
         if self._compile and self.uses_tensors:
             options = dict(self._compile) if isinstance(self._compile, dict) else {}
@@ -310,7 +300,7 @@ class CEMPlanner(MPCPlannerBase):
         return function
 
     def __getstate__(self) -> dict[str, Any]:
-        # The function holds on to these very modules; a copy builds its own.
+        # The function holds on to these very modules, so a copy builds its own.
         return {**super().__getstate__(), "_planning_function": None}
 
     def _apply(self, *args: Any, **kwargs: Any) -> CEMPlanner:
@@ -388,7 +378,7 @@ class CEMPlanner(MPCPlannerBase):
 
     def _check_observation(self, tensordict: TensorDictBase) -> None:
         batch, device = tensordict.batch_size, self._action_low.device
-        for key, spec in self._checked.items():
+        for key, spec in self._expected.items():
             value = tensordict.get(key, None)
             shape = torch.Size([*batch, *spec.shape])
             if value is None:
@@ -403,59 +393,12 @@ class CEMPlanner(MPCPlannerBase):
                 raise ValueError(f"{key}: expected finite observations, got some that are not.")
 
 
-def _action_spec(env: EnvBase, key: NestedKey) -> TensorSpec:
-    keys = [unravel_key(k) for k in env.action_keys]
-    if keys != [key]:
-        raise ValueError(f"action_key: expected the only action of {keys}, got {key!r}.")
-    spec = env.full_action_spec_unbatched[key]
-    if not spec.dtype.is_floating_point:
-        raise ValueError(f"env: expected continuous actions, got {spec.dtype}.")
-    return spec
-
-
-def _limits(spec: TensorSpec) -> tuple[Tensor, Tensor]:
-    """Bounds ``[m]`` of an action, infinite where there are none."""
-    shape, device = spec.shape, spec.device
-    if isinstance(spec, Bounded):
-        low, high = spec.space.low.expand(shape), spec.space.high.expand(shape)
-    else:
-        low, high = torch.full(shape, -torch.inf), torch.full(shape, torch.inf)
-    return tuple(t.to(dtype=spec.dtype, device=device).reshape(-1).clone() for t in (low, high))
-
-
-def _check_reward(env: EnvBase, key: NestedKey) -> None:
-    keys = [unravel_key(("next", k)) for k in env.reward_keys]
-    if key not in keys:
-        raise ValueError(f"reward_key: expected one of {keys}, got {key!r}.")
-    shape = env.full_reward_spec_unbatched[unravel_key(key[1:])].shape
-    if shape.numel() != 1:
-        raise ValueError(f"reward_key: expected one reward a step, got {key!r} of {list(shape)}.")
-
-
-def _done_keys(env: EnvBase, keys: NestedKey | Sequence[NestedKey] | None) -> list[NestedKey]:
-    known = [unravel_key(("next", k)) for k in env.done_keys]
-    if keys is None:
-        ends = [key for key in known if key[-1] == "terminated"]
-        return ends or [key for key in known if key[-1] == "done"]
-    if isinstance(keys, str) or (isinstance(keys, tuple) and tuple(keys) in known):
-        keys = [keys]
-    keys = [unravel_key(key) for key in keys]
-    if unknown := [key for key in keys if key not in known]:
-        raise ValueError(f"done_keys: expected some of {known}, got {unknown}.")
-    return keys
-
-
-def _observation_key(env: EnvBase, key: NestedKey | None) -> NestedKey | None:
-    keys = [unravel_key(k) for k in env.observation_spec.keys(True, True)]
+def _choose(situation: Collection[NestedKey], key: NestedKey | None) -> NestedKey | None:
+    """The observation that a tensor model is given, if it is clear which."""
     if key is not None:
-        if unravel_key(key) not in keys:
-            raise ValueError(f"observation_key: expected one of {keys}, got {key!r}.")
+        if unravel_key(key) not in situation:
+            raise ValueError(f"observation_key: expected one of {list(situation)}, got {key!r}.")
         return unravel_key(key)
-    if "observation" in keys:
+    if "observation" in situation:
         return "observation"
-    return keys[0] if len(keys) == 1 else None
-
-
-def _specs(env: EnvBase, keys: Sequence[NestedKey]) -> dict[NestedKey, TensorSpec]:
-    specs = env.full_observation_spec_unbatched
-    return {key: specs[key] for key in keys}
+    return next(iter(situation)) if len(situation) == 1 else None

@@ -1,15 +1,14 @@
-"""Actors and critics as functions of tensors, and environments as models."""
+"""Actors and critics of TensorDict modules as the functions that a plan calls."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import step_mdp
 
 
 def tensor_function(module: TensorDictModuleBase, out_key: NestedKey) -> Callable[..., Tensor]:
@@ -66,60 +65,40 @@ def _has_hooks(module: torch.nn.Module) -> bool:
     return bool(module._forward_hooks or module._forward_pre_hooks)
 
 
+def actor_function(
+    module: TensorDictModuleBase, action_key: NestedKey, action_dim: int
+) -> Callable[[Any], Tensor]:
+    """Observation, a tensor or a tensordict ``[rows]`` -> action ``[rows, m]``."""
+    function, keys = tensor_function(module, action_key), list(module.in_keys)
+
+    def act(observation: Any) -> Tensor:
+        action = function(*(_read(observation, key) for key in keys))
+        return action.reshape(-1, action_dim)
+
+    return act
+
+
+def value_function(
+    module: TensorDictModuleBase,
+    value_key: NestedKey,
+    action_key: NestedKey,
+    action_shape: torch.Size,
+) -> Callable[[Any, Tensor], Tensor]:
+    """Observation, a tensor or a tensordict, and action ``[rows, m]`` -> min(Q1, Q2) ``[rows]``."""
+    function, keys = tensor_function(module, value_key), list(module.in_keys)
+
+    def value(observation: Any, action: Tensor) -> Tensor:
+        action = action.reshape(-1, *action_shape)
+        inputs = (action if key == action_key else _read(observation, key) for key in keys)
+        return smallest(function(*inputs))
+
+    return value
+
+
 def smallest(values: Tensor) -> Tensor:
     """min(Q1, Q2) ``[rows]`` of values ``[rows, critics]``, or stacked ``[critics, rows, 1]``."""
     return values.amin(-1) if values.ndim == 2 else values.squeeze(-1).amin(0)
 
 
-class EnvModel:
-    """A stateless TorchRL environment in the place of a tensor model: states are tensordicts.
-
-    It steps without ever resetting: sequences that ended go on, and do not count any more.
-
-    Args:
-        env: the environment, of batch size ``[]``.
-        action_key: its action.
-        action_shape: shape of one action.
-        reward_key: where a step leaves the reward, with the leading ``"next"``.
-        done_keys: where a step leaves that nothing follows, with the leading ``"next"``.
-    """
-
-    def __init__(
-        self,
-        env: EnvBase,
-        action_key: NestedKey,
-        action_shape: torch.Size,
-        reward_key: NestedKey,
-        done_keys: Sequence[NestedKey],
-    ) -> None:
-        self.env = env
-        self.action_key = action_key
-        self.action_shape = action_shape
-        self.reward_key = reward_key
-        self.done_keys = tuple(done_keys)
-
-    def locate(self, observation: TensorDictBase) -> TensorDictBase:
-        """What the environment needs to step is what was observed."""
-        return observation
-
-    def observe(self, state: TensorDictBase) -> TensorDictBase:
-        """Actor and critic read their own keys."""
-        return state
-
-    def transition(
-        self, state: TensorDictBase, action: Tensor
-    ) -> tuple[TensorDictBase, Tensor, Tensor]:
-        """One step of the environment, ``[rows]``."""
-        state = state.copy().set(self.action_key, action.reshape(-1, *self.action_shape))
-        state = self.env.step(state)
-        reward = state.get(self.reward_key).reshape(-1)
-        over = torch.zeros_like(reward, dtype=torch.bool)
-        for key in self.done_keys:
-            over = over | state.get(key).reshape(-1)
-        next_state = step_mdp(
-            state,
-            reward_keys=self.env.reward_keys,
-            done_keys=self.env.done_keys,
-            action_keys=self.env.action_keys,
-        )
-        return next_state, reward, over
+def _read(observation: Any, key: NestedKey) -> Tensor:
+    return observation if isinstance(observation, Tensor) else observation.get(key)
