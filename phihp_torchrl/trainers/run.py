@@ -32,6 +32,8 @@ from phihp_torchrl.trainers.start import check_same, start_directory
 
 _log = logging.getLogger(__name__)
 
+_BAR_UNITS = {"model": " steps", "policy": " updates", "evaluate": " parts"}
+
 
 @dataclass(frozen=True)
 class RunResult:
@@ -131,7 +133,9 @@ class _Run:
         position, saved = self.position, time.monotonic()
         done, total = phase.progress
         hidden = None if self.config.progress else True  # None: shown on a terminal alone
-        with tqdm(desc=name, initial=done, total=total, unit="unit", disable=hidden) as bar:
+        with tqdm(
+            desc=name, initial=done, total=total, unit=_BAR_UNITS[name], disable=hidden
+        ) as bar:
             while not phase.done:
                 if self.interrupt:
                     self._save(name, phase)
