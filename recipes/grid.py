@@ -3,8 +3,9 @@
     python recipes/grid.py --tasks pendulum acrobot --seeds 0 1 2 --shares 1 0.1 --jobs 2
 
 A finished run is skipped, one that was cut off goes on from its checkpoint. Overrides for
-recipes/phihp.py follow after ``--``. Runs live in outputs/grid/; their configuration, metadata, metrics
-and evaluation (all text) are copied to results/runs/, from where recipes/results.py makes the tables.
+recipes/phihp.py follow after ``--``. Runs live in outputs/grid/; their configuration, metadata,
+metrics and evaluation (all text) are copied to results/runs/, from where recipes/results.py makes
+the tables.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", nargs="+", default=sorted(PUBLISHED_SAMPLES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
-    parser.add_argument("--shares", nargs="+", type=float, default=[1.0])
+    parser.add_argument("--shares", nargs="+", type=float, default=[0.5])
     parser.add_argument("--label", default="default", help="name of the configuration in results/")
     parser.add_argument("--jobs", type=int, default=2, help="runs at a time, one thread each")
     parser.add_argument("overrides", nargs="*", help="for recipes/phihp.py, after --")

@@ -81,7 +81,7 @@ def _is_number(text: str) -> bool:
 
 
 def group(runs: list[Run]) -> dict[tuple[str, int], list[Run]]:
-    """Runs by task and number of samples, in the order of the paper and from many samples to few."""
+    """Runs by task and number of samples: tasks as in the paper, from many samples to few."""
     groups = defaultdict(list)
     for run in runs:
         groups[run.task, run.samples].append(run)
@@ -158,15 +158,16 @@ def main() -> None:
     for label in labels:
         chosen = [run for run in runs if run.label == label]
         groups = group(chosen)
-        full = {k: g for k, g in groups.items() if k[1] == PUBLISHED_SAMPLES[k[0]]}
+        full = {group_runs[0].task: group_runs for group_runs in reversed(groups.values())}
+        full = {task: full[task] for task in PUBLISHED_SAMPLES if task in full}
         main_table = returns_table(summarise(group_runs) for group_runs in full.values())
-        seeds = ", ".join(str(seed) for seed in sorted({run.seed for run in chosen}))
+        seeds = " ".join(str(seed) for seed in sorted({run.seed for run in chosen}))
         sections += [
             f"## {label}\n",
-            f"`python recipes/grid.py --label {label} --seeds {seeds.replace(',', '')}`: mean ± std over "
-            "seeds, 50 evaluation episodes each, from seeds that no training uses. "
-            f"{origins(chosen)}\n",
-            "### Returns at the published number of real samples\n",
+            f"`python recipes/grid.py --label {label} --seeds {seeds}` (commands in full in "
+            "`results/runs/*/metadata.json`): mean ± std over seeds, 50 evaluation episodes each, "
+            f"from seeds that no training uses. {origins(chosen)}\n",
+            "### Returns at the most real samples that were used\n",
             main_table,
             "### What planning adds to the actor, the same episodes\n",
             difference_table(groups),
@@ -176,12 +177,9 @@ def main() -> None:
             time_table(groups),
         ]
         if label == "default":
-            fill_readme(f"{main_table}\nSeeds {seeds}. {origins(list(_flatten(full)))}\n")
+            used = [run for group_runs in full.values() for run in group_runs]
+            fill_readme(f"{main_table}\nSeeds {seeds}. {origins(used)}\n")
     Path("results/README.md").write_text("\n".join(sections))
-
-
-def _flatten(groups: dict[tuple[str, int], list[Run]]) -> list[Run]:
-    return [run for group_runs in groups.values() for run in group_runs]
 
 
 def fill_readme(table: str) -> None:
