@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.objectives import TD3Loss, ValueEstimators
+from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
 from phihp_torchrl.agents.functional import (
     Batch,
@@ -72,6 +72,7 @@ def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
         noise_clip=config.target_noise_clip * high,
     )
     loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
+    SoftUpdate(loss, tau=config.tau)  # tells the loss that its targets are looked after
     return loss
 
 
