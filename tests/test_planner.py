@@ -17,7 +17,8 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, InitTracker, PendulumEnv, RewardScaling, TransformedEnv
 from torchrl.envs.model_based import ModelBasedEnvBase
 from torchrl.envs.model_based import WorldModelEnv as StockWorldModelEnv
-from torchrl.modules import MLP, MPCPlannerBase, TanhModule, WorldModel
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import MLP, AdditiveGaussianModule, MPCPlannerBase, TanhModule, WorldModel
 
 from phihp_torchrl import HybridDynamics, get_task
 from phihp_torchrl.dynamics import TaskWorldModel
@@ -340,7 +341,7 @@ def test_a_sequence_that_is_not_finite_never_wins():
             return super().transition(state, action.nan_to_num(0.3))
 
     problem = Problem(Forgiving(), bounds(), lambda observation: observation * nan)
-    s = settings(num_policy_candidates=20, select="best")
+    s = settings(planning_horizon=1, num_policy_candidates=20, select="best")
     assert plan(ZEROS, draw(s), problem=problem, settings=s).actions.isfinite().all()
 
 
@@ -597,6 +598,18 @@ def test_modules_of_every_kind_are_the_same_function():
     for action in actions[1:]:
         torch.testing.assert_close(action, actions[0])
     assert calls
+
+
+def test_an_exploring_actor_does_not_explore_in_plans():
+    _, env, actor, _ = task_parts("pendulum")
+    exploring = TensorDictSequential(actor, AdditiveGaussianModule(env.action_spec))
+    tensordict = TensorDict(observation=torch.tensor([0.0, 1.0, 0.0]))
+    scores = []
+    with set_exploration_type(ExplorationType.RANDOM):
+        for module in (actor, exploring):
+            planner = make_planner(env, module)
+            scores.append(planner.plan(tensordict, noise_for(planner)).score)
+    assert torch.equal(*scores)
 
 
 @pytest.mark.parametrize("stacked", [True, False])
