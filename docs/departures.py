@@ -1,0 +1,118 @@
+"""Keep the list of the default preset's departures from the paper in step with the YAML files.
+
+    python docs/departures.py
+
+It compares the two presets on every task and rewrites the settings in the table of docs/recipes.md.
+The columns "why" and "measured effect" are people's and stay as they are; a departure that is new
+gets an empty reason. mkdocs runs it as a hook, which only checks: a table that is out of date or a
+departure without a reason stops the build.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "recipes.md"
+CONFIG = ROOT / "recipes" / "config"
+START, END = "<!-- departures:start -->\n", "<!-- departures:end -->"
+HEADER = "| # | key | paper | default | why | measured effect |\n|---:|:---|:---|:---|:---|:---|\n"
+NEW = ("", "not yet measured")
+
+
+def settings(preset: str) -> dict[str, dict[str, Any]]:
+    """Value of every key of a preset, by key and task; the preset's own value is under ``""``."""
+    base = _flatten(yaml.safe_load((CONFIG / "preset" / f"{preset}.yaml").read_text()))
+    values = {key: {"": value} for key, value in base.items()}
+    for path in sorted((CONFIG / "task").glob("*.yaml"), key=lambda path: path.stem):
+        sections = yaml.safe_load(path.read_text())["presets"]
+        for key, value in {**base, **_flatten(sections.get(preset) or {})}.items():
+            values[key][path.stem] = value
+    return values
+
+
+def departures() -> dict[str, tuple[str, str]]:
+    """The published and our settings of each key in which some task departs, as Markdown."""
+    paper, ours = settings("paper"), settings("default")
+    tasks = [task for task in paper["model.real_steps"] if task]
+    return {
+        key: (_describe(paper[key]), _describe(ours[key]))
+        for key in ours
+        if key != "preset" and any(paper[key][task] != ours[key][task] for task in tasks)
+    }
+
+
+def table(page: str) -> str:
+    """The table as it should be, with the reasons that ``page`` has."""
+    reasons = {}
+    for line in page.split(START)[1].split(END)[0].splitlines()[2:]:
+        cells = [cell.strip() for cell in line.strip("|").split(" | ")]
+        reasons[cells[1].strip("`")] = (cells[4], cells[5])
+    rows = [
+        f"| {number} | `{key}` | {paper} | {ours} | {why} | {effect} |\n"
+        for number, (key, (paper, ours)) in enumerate(departures().items(), 1)
+        for why, effect in [reasons.get(key, NEW)]
+    ]
+    return HEADER + "".join(rows)
+
+
+def on_pre_build(config: Any) -> None:
+    """Stop mkdocs where the page and the presets disagree."""
+    from mkdocs.exceptions import Abort
+
+    page = PAGE.read_text()
+    if table(page) not in page:
+        raise Abort("docs/recipes.md: its departures are out of date: python docs/departures.py")
+    if unexplained := _unexplained(page):
+        raise Abort(f"docs/recipes.md: departures without a reason: {unexplained}")
+
+
+def main() -> None:
+    """Rewrite the table."""
+    page = PAGE.read_text()
+    before, rest = page.split(START)
+    page = before + START + table(page) + END + rest.split(END)[1]
+    PAGE.write_text(page)
+    if unexplained := _unexplained(page):
+        sys.exit(f"docs/recipes.md: please say why: {unexplained}")
+
+
+def _unexplained(page: str) -> list[str]:
+    rows = [line.split(" | ") for line in page.split(START)[1].split(END)[0].splitlines()[2:]]
+    return [cells[1].strip("`") for cells in rows if not cells[4].strip()]
+
+
+def _flatten(mapping: dict[str, Any], path: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in mapping.items():
+        name = f"{path}{key}"
+        flat |= _flatten(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return flat
+
+
+def _describe(values: dict[str, Any]) -> str:
+    """The common value first, then the tasks that have another."""
+    groups: dict[str, list[str]] = {_show(values[""]): []}
+    for task, value in values.items():
+        if task:
+            groups.setdefault(_show(value), []).append(task)
+    groups = {value: tasks for value, tasks in groups.items() if tasks}
+    if len(groups) == 1:
+        return f"`{next(iter(groups))}`"
+    common, *others = groups if groups.get(_show(values[""])) else ["", *groups]
+    texts = [f"`{common}`"] if common else []
+    return "; ".join([*texts, *(f"`{value}` ({', '.join(groups[value])})" for value in others)])
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    return yaml.safe_dump(value, default_flow_style=True).removesuffix("\n...\n").strip()
+
+
+if __name__ == "__main__":
+    main()
