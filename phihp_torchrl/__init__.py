@@ -1,4 +1,4 @@
-"""PhIHP as TorchRL components: a physics-informed model, a policy learned in imagination, hybrid planning."""
+"""PhIHP in TorchRL: a physics-informed model, a policy learned in imagination, hybrid planning."""
 
 from __future__ import annotations
 

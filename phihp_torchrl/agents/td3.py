@@ -151,8 +151,8 @@ class TD3Update(nn.Module):
         """Train on ``policy_delay`` batches of equal size, given as one.
 
         Args:
-            batch: transitions, ``[policy_delay * N]`` rows: ``N`` for each critic update, of which the
-                last also serve the actor's.
+            batch: transitions, ``[policy_delay * N]`` rows: ``N`` for each critic update, of which
+                the last also serve the actor's.
             learning_rate_scale: factor on both learning rates.
             generator: source of the target policy's noise.
 
@@ -165,7 +165,8 @@ class TD3Update(nn.Module):
         config, rows = self.config, len(batch.reward)
         if rows == 0 or rows % config.policy_delay:
             raise ValueError(
-                f"batch: expected a multiple of policy_delay = {config.policy_delay} rows, got {rows}."
+                f"batch: expected a multiple of policy_delay = {config.policy_delay} rows, "
+                f"got {rows}."
             )
         high = self.loss.max_action
         noise = torch.randn(batch.action.shape, generator=generator, device=high.device)

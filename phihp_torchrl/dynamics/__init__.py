@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from phihp_torchrl.dynamics.fitting import FitConfig, FitReport, fit
+from phihp_torchrl.dynamics.held_out import BLOCK, rollout_error, split
 from phihp_torchrl.dynamics.hybrid import HybridDynamics
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.dynamics.prior import PhysicsPrior, WorldPhysics, perturbed_constants
@@ -10,6 +11,7 @@ from phihp_torchrl.dynamics.residual import ResidualMLP
 from phihp_torchrl.dynamics.world_model import TaskWorldModel
 
 __all__ = [
+    "BLOCK",
     "DynamicsLoss",
     "FitConfig",
     "FitReport",
@@ -20,4 +22,6 @@ __all__ = [
     "WorldPhysics",
     "fit",
     "perturbed_constants",
+    "rollout_error",
+    "split",
 ]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.config import ConfigError, from_mapping, to_mapping
 from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
-from phihp_torchrl.trainers.model import CollectConfig, ModelConfig, ModelTrainer
+from phihp_torchrl.trainers.model import ModelConfig, ModelTrainer, make_dynamics
 from phihp_torchrl.trainers.phases import read_result
 from phihp_torchrl.trainers.policy import PolicyConfig, PolicyTrainer, StartConfig
 from phihp_torchrl.trainers.run import RunResult, run
@@ -33,6 +34,7 @@ __all__ = [
     "StartConfig",
     "from_mapping",
     "import_plugins",
+    "make_dynamics",
     "make_logger",
     "read_request",
     "read_result",

@@ -7,60 +7,31 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.envs import EnvBase, GymEnv
+from torchrl.envs import EnvBase
 
 from phihp_torchrl.dynamics import (
+    BLOCK,
     DynamicsLoss,
     FitConfig,
     HybridDynamics,
     PhysicsPrior,
     ResidualMLP,
-    TaskWorldModel,
     fit,
     perturbed_constants,
+    rollout_error,
+    split,
 )
-from phihp_torchrl.envs import WorldModelEnv
-from phihp_torchrl.planners import CEMPlanner
 from phihp_torchrl.tasks import Task
+from phihp_torchrl.trainers.collect import (
+    CollectConfig,
+    make_real_env,
+    planning_policy,
+    random_policy,
+)
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
-_BLOCK = 20
-"""Held-out data are whole blocks of this many steps, one in ten."""
-
-
-@dataclass(frozen=True)
-class CollectConfig:
-    """How the model-based controller collects data.
-
-    Args:
-        planning_horizon: actions in a plan.
-        replan_every: steps of a plan to act before the next.
-        num_candidates: population of the search.
-        top_k: its elites.
-        optim_steps: its iterations.
-        noise: std of the noise on the first planned iteration's actions, in units of the action bounds.
-            It fades to zero with the last.
-        random_hold: steps for which a random action is held in the first iteration, so that slow
-            systems move.
-        exploration_reward: whether to plan for the task's exploration reward, where it has one.
-    """
-
-    planning_horizon: int = 30
-    replan_every: int = 15
-    num_candidates: int = 500
-    top_k: int = 20
-    optim_steps: int = 3
-    noise: float = 0.3
-    random_hold: int = 1
-    exploration_reward: bool = True
-
-    def __post_init__(self) -> None:
-        if not self.noise >= 0:
-            raise ValueError(f"noise: expected a number >= 0, got {self.noise}.")
-        if self.random_hold < 1:
-            raise ValueError(f"random_hold: expected a positive number, got {self.random_hold}.")
 
 
 @dataclass(frozen=True)
@@ -69,8 +40,8 @@ class ModelConfig:
 
     Args:
         real_steps: real transitions in all.
-        steps_per_iteration: real transitions between two fits, T; ``None`` for a tenth of all of them,
-            but no fewer than 50.
+        steps_per_iteration: real transitions between two fits, T; ``None`` for a tenth of all of
+            them, but no fewer than 50.
         kind: ``"hybrid"``, ``"data_driven"``, ``"prior"`` or ``"oracle"``.
         constants_error: relative error of the prior's first guess, signs drawn by the seed.
         hidden_sizes: widths of the residual's hidden layers.
@@ -110,6 +81,10 @@ class ModelConfig:
             raise ValueError(
                 f"kind: expected 'hybrid', 'data_driven', 'prior' or 'oracle', got {self.kind!r}."
             )
+        if self.residual_outputs not in ("velocities", "all"):
+            raise ValueError(
+                f"residual_outputs: expected 'velocities' or 'all', got {self.residual_outputs!r}."
+            )
         if self.activation not in _ACTIVATIONS:
             raise ValueError(
                 f"activation: expected one of {sorted(_ACTIVATIONS)}, got {self.activation!r}."
@@ -134,8 +109,8 @@ def make_dynamics(
     Args:
         task: the task.
         config: phase 1.
-        generator: source of the signs of the first guess's errors. The networks' initial weights come
-            from torch's global generator.
+        generator: source of the signs of the first guess's errors. The networks' initial weights
+            come from torch's global generator.
     """
     if config.kind == "oracle":
         return HybridDynamics.oracle(task)
@@ -153,7 +128,7 @@ def make_dynamics(
 
 
 class ModelTrainer:
-    """Learns the model from real steps: random steps, fit, planned steps, fit, …
+    """Learns the model from real steps: random steps, fit, planned steps, fit, and so on.
 
     Args:
         task: the task.
@@ -185,7 +160,7 @@ class ModelTrainer:
                 raise ValueError(f"env: expected an environment with {key!r}, got {self.env}.")
         self.generator = torch.Generator().manual_seed(seed)
         self.dynamics = make_dynamics(task, config, self.generator)
-        self._initial = {k: v.clone() for k, v in self.dynamics.state_dict().items()}
+        self.initial = {k: v.clone() for k, v in self.dynamics.state_dict().items()}
         self.loss = DynamicsLoss(self.dynamics, lambda_0=config.lambda_0, tau_ph=config.tau_ph)
         self.data: TensorDict | None = None
         self.iteration = 0
@@ -223,18 +198,27 @@ class ModelTrainer:
 
     def collect(self, steps: int) -> TensorDict:
         """Take real steps: at random in the first iteration, with the planner in later ones."""
-        policy = self._random_policy() if self.iteration == 0 else self._planning_policy()
+        config, generator = self.config, self.generator
+        if self.iteration == 0:
+            policy = random_policy(self.task, config.collect, generator)
+        else:
+            fade = max(0.0, 1.0 - (self.iteration - 1) / max(1, config.iterations - 2))
+            policy = planning_policy(
+                self.task, self.dynamics, config.collect, generator, fade * config.collect.noise
+            )
         # A seed of its own for every iteration: a resumed run sees the same resets.
         self.env.set_seed(self._draw_seed())
         with torch.no_grad():
             rollout = self.env.rollout(steps, policy, break_when_any_done=False)
+        done = rollout["next", "done"].clone()
+        done[-1] = True  # the next rollout starts from a reset
         return TensorDict(
             observation=rollout["observation"].float(),
             action=rollout["action"].float(),
             next=TensorDict(
                 observation=rollout["next", "observation"].float(),
                 reward=rollout["next", "reward"].float(),
-                done=rollout["next", "done"],
+                done=done,
                 batch_size=[steps],
             ),
             batch_size=[steps],
@@ -244,7 +228,7 @@ class ModelTrainer:
         """Fit the model to all data and measure it."""
         config = self.config.fit
         if not self.config.warm_start:
-            self.dynamics.load_state_dict(self._initial)
+            self.dynamics.load_state_dict(self.initial)
             self.loss.lambda_.fill_(self.config.lambda_0)
         elif self.iteration > 1 and not self.done:
             config = replace(
@@ -264,7 +248,7 @@ class ModelTrainer:
             "model/residual_share": self.dynamics.residual_share(state, action),
         }
         if blocks is not None:
-            metrics[f"model/rollout_error_{_BLOCK}"] = rollout_error(self.loss, blocks)
+            metrics[f"model/rollout_error_{BLOCK}"] = rollout_error(self.loss, blocks)
         if isinstance(self.dynamics.prior, PhysicsPrior):
             constants = self.dynamics.prior.constants()
             for name, value in self.task.system.identifiable(constants).items():
@@ -275,10 +259,8 @@ class ModelTrainer:
         """Everything that a resumed run needs, tensors and numbers only."""
         return {
             "dynamics": self.dynamics.state_dict(),
-            "initial": self._initial,
-            "loss": {
-                name: buffer for name, buffer in self.loss.named_buffers(recurse=False)
-            },
+            "initial": self.initial,
+            "loss": {name: buffer for name, buffer in self.loss.named_buffers(recurse=False)},
             "data": None if self.data is None else self.data.to_dict(),
             "iteration": self.iteration,
             "generator": self.generator.get_state(),
@@ -287,7 +269,7 @@ class ModelTrainer:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from :meth:`state_dict`."""
         self.dynamics.load_state_dict(state["dynamics"])
-        self._initial = dict(state["initial"])
+        self.initial = dict(state["initial"])
         for name, value in state["loss"].items():
             self.loss.get_buffer(name).copy_(value)
         data = state["data"]
@@ -297,82 +279,3 @@ class ModelTrainer:
 
     def _draw_seed(self) -> int:
         return int(torch.randint(2**31, (), generator=self.generator))
-
-    def _random_policy(self) -> Any:
-        high = torch.tensor(self.task.action_high)
-        hold, count, action = self.config.collect.random_hold, 0, None
-
-        def policy(tensordict: TensorDictBase) -> TensorDictBase:
-            nonlocal count, action
-            if count % hold == 0:
-                action = high * (2.0 * torch.rand(high.shape, generator=self.generator) - 1.0)
-            count += 1
-            return tensordict.set("action", action.clone())
-
-        return policy
-
-    def _planning_policy(self) -> Any:
-        config, task = self.config.collect, self.task
-        if config.exploration_reward and task.exploration_reward is not None:
-            task = replace(task, reward=task.exploration_reward)
-        planner = CEMPlanner(
-            WorldModelEnv(TaskWorldModel(task, self.dynamics), seed=0),
-            planning_horizon=config.planning_horizon,
-            optim_steps=config.optim_steps,
-            num_candidates=config.num_candidates,
-            top_k=config.top_k,
-            gamma=1.0,
-            replan_every=config.replan_every,
-            generator=self.generator,
-        )
-        high = torch.tensor(task.action_high)
-        fade = max(0.0, 1.0 - (self.iteration - 1) / max(1, self.config.iterations - 2))
-
-        def policy(tensordict: TensorDictBase) -> TensorDictBase:
-            if tensordict["step_count"].item() == 0:
-                planner.reset()
-            observed = TensorDict(observation=tensordict["observation"].float())
-            noise = torch.randn(high.shape, generator=self.generator)
-            action = planner(observed)["action"] + fade * config.noise * high * noise
-            return tensordict.set("action", task.clip_action(action))
-
-        return policy
-
-
-def make_real_env(task: Task) -> EnvBase:
-    """The task's gymnasium world as a TorchRL environment that counts and limits its steps."""
-    import gymnasium
-
-    from torchrl.envs import GymWrapper, StepCounter, TransformedEnv
-
-    world = gymnasium.make("phihp/Task-v0", task=task)
-    return TransformedEnv(GymWrapper(world), StepCounter())
-
-
-def split(data: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase, TensorDictBase | None]:
-    """Hold out every tenth block of consecutive steps.
-
-    Args:
-        data: transitions ``[N]`` in the order they happened.
-
-    Returns:
-        Transitions to learn from, held-out transitions, and those held-out blocks in which no episode
-        ended, ``[blocks, steps]``, or ``None`` if there are none.
-    """
-    index = torch.arange(len(data))
-    held = (index // _BLOCK) % 10 == 9
-    if not held.any():  # too few for a block
-        held = index % 10 == 9 if len(data) >= 10 else index == len(data) - 1
-        return data[~held] if len(data) > 1 else data, data[held], None
-    blocks = data[: len(data) // _BLOCK * _BLOCK].reshape(-1, _BLOCK)[9::10]
-    whole = ~blocks["next", "done"][:, :-1].any(-1).any(-1)
-    blocks = blocks[whole]
-    return data[~held], data[held], blocks if len(blocks) else None
-
-
-@torch.no_grad()
-def rollout_error(loss: DynamicsLoss, blocks: TensorDictBase) -> Tensor:
-    """Mean distance ‖s - ŝ‖ after the last step of each block ``[blocks, steps]``, raw units."""
-    state, action, next_state = loss.transitions(blocks)
-    predicted = loss.dynamics.rollout(state[:, 0], action)[:, -1]
-    return loss.dynamics.task.system.difference(next_state[:, -1], predicted).norm(dim=-1).mean()

@@ -58,6 +58,8 @@ class PolicyConfig:
         evaluation_interval: updates between two evaluations in the model.
         evaluation_episodes: imagined episodes in an evaluation.
         evaluation_steps: their length; ``None`` for the task's own limit.
+        real_evaluation_episodes: episodes of the actor in the simulated real world at each
+            evaluation, for the log alone; 0 for none.
         max_seconds: stop early after this time; ``None`` for never.
         start: where imagined lives start.
         td3: TD3's own hyper-parameters.
@@ -77,6 +79,7 @@ class PolicyConfig:
     evaluation_interval: int = 500
     evaluation_episodes: int = 64
     evaluation_steps: int | None = None
+    real_evaluation_episodes: int = 10
     max_seconds: float | None = None
     start: StartConfig = field(default_factory=StartConfig)
     td3: TD3Config = field(default_factory=TD3Config)
@@ -98,7 +101,7 @@ class PolicyConfig:
         for name in ("random_fraction", "decay"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a number in [0, 1], got {getattr(self, name)}.")
-        for name in ("random_steps", "exploration_noise"):
+        for name in ("random_steps", "exploration_noise", "real_evaluation_episodes"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
         for name in ("max_age", "evaluation_steps", "max_seconds"):
@@ -121,8 +124,8 @@ class PolicyTrainer:
     """Learns actor and critics from imagined transitions, many worlds at once.
 
     After every ``evaluation_interval`` updates the noise-free actor plays episodes from the task's
-    resets in the model, and the best actor met is kept together with its critics. Neither the real world
-    nor an evaluation seed has a say in that choice.
+    resets in the model, and the best actor met is kept together with its critics. The real world
+    is played in for the log alone: neither it nor an evaluation seed has a say in that choice.
 
     Args:
         task: the task.
@@ -136,7 +139,7 @@ class PolicyTrainer:
     Examples:
         >>> from phihp_torchrl import get_task
         >>> task = get_task("pendulum")
-        >>> config = PolicyConfig(updates=4, evaluation_interval=4, evaluation_steps=5, random_steps=128)
+        >>> config = PolicyConfig(updates=4, evaluation_interval=4, evaluation_steps=5)
         >>> trainer = PolicyTrainer(task, HybridDynamics.oracle(task), config, seed=0)
         >>> while not trainer.done:
         ...     metrics = trainer.advance()
@@ -169,9 +172,9 @@ class PolicyTrainer:
         self.best_return = -math.inf
         self.updates = 0
         self.seconds = 0.0
-        self._evaluation_states = task.reset.sample(
-            [config.evaluation_episodes], generator=self.generator
-        )
+        episodes = config.evaluation_episodes + config.real_evaluation_episodes
+        self._evaluation_states = task.reset.sample([episodes], generator=self.generator)
+        self._world = TaskWorldModel(task, HybridDynamics.oracle(task))
 
     @property
     def max_age(self) -> int:
@@ -204,27 +207,25 @@ class PolicyTrainer:
                 if self.updates % config.td3.policy_delay == 0:
                     losses = self._learn()
                 self.updates += 1
-        score = imagined_return(
-            self.world_model,
-            self.update.actor,
-            self._evaluation_states,
-            self.loss.max_action,
-            config.evaluation_steps or self.task.max_steps,
+        imagined = self._play(
+            self.world_model, self._evaluation_states[: config.evaluation_episodes]
         )
-        imagined = torch.nan_to_num(score, nan=-math.inf).mean().item()
         if imagined > self.best_return:
             self.best_return = imagined
             for kept, layer in zip(self.best, self._layers(), strict=True):
                 kept.copy_(layer)
-        self.seconds += time.perf_counter() - start
-        return {
+        metrics = {
             "policy/updates": float(self.updates),
             "policy/imagined_steps": float(self.replay.written),
             "policy/imagined_return": imagined,
             "policy/best_imagined_return": self.best_return,
-            "policy/seconds": self.seconds,
             **{f"policy/{name}": value.item() for name, value in losses.items()},
         }
+        if config.real_evaluation_episodes:
+            states = self._evaluation_states[config.evaluation_episodes :]
+            metrics["policy/real_return"] = self._play(self._world, states)
+        self.seconds += time.perf_counter() - start
+        return {**metrics, "policy/seconds": self.seconds}
 
     def actor(self) -> TensorDictModule:
         """The actor as it is now."""
@@ -265,6 +266,12 @@ class PolicyTrainer:
         self.seconds = state["seconds"]
         self._evaluation_states = state["evaluation_states"]
         self.generator.set_state(state["generator"])
+
+    def _play(self, world_model: TaskWorldModel, states: Tensor) -> float:
+        """Mean return of the noise-free actor; minus infinity where it left the finite numbers."""
+        steps = self.config.evaluation_steps or self.task.max_steps
+        score = imagined_return(world_model, self.update.actor, states, self.loss.max_action, steps)
+        return torch.nan_to_num(score, nan=-math.inf).mean().item()
 
     def _layers(self) -> list[Tensor]:
         return [*self.update.actor, *self.update.critics]
