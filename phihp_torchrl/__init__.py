@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from phihp_torchrl.deployment import load_agent
-from phihp_torchrl.dynamics import HybridDynamics
+from phihp_torchrl.dynamics import DynamicsLoss, HybridDynamics
 from phihp_torchrl.envs import WorldModelEnv  # (importing envs registers the gymnasium ids)
 from phihp_torchrl.planners import CEMPlanner
 from phihp_torchrl.tasks import Task, get_task, register_task
 
 __all__ = [
     "CEMPlanner",
+    "DynamicsLoss",
     "HybridDynamics",
     "Task",
     "WorldModelEnv",
