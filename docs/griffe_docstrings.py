@@ -9,7 +9,9 @@ from typing import Any
 from griffe import Extension
 
 _ROLE = re.compile(r":(?:class|func|meth|attr|data|mod):`~?(?:[\w.]*\.)?(\w+)`")
-_MATH = re.compile(r"^(?P<indent> *)\.\. math::(?P<first>.*)\n(?P<rest>(?:\n|(?P=indent) +.*\n?)*)", re.M)
+_MATH = re.compile(
+    r"^(?P<indent> *)\.\. math::(?P<first>.*)\n(?P<rest>(?:\n|(?P=indent) +.*\n?)*)", re.MULTILINE
+)
 
 
 class Docstrings(Extension):
