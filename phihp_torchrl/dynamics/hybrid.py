@@ -63,6 +63,7 @@ class HybridDynamics(nn.Module):
         *,
         constants: Mapping[str, float] | None = None,
         hidden_sizes: Sequence[int] = (16, 16),
+        activation: type[nn.Module] = nn.ReLU,
         residual_outputs: str = "velocities",
         integrator: str | Integrator = "semi_implicit_euler",
     ) -> HybridDynamics:
@@ -72,6 +73,7 @@ class HybridDynamics(nn.Module):
             task: the task.
             constants: first guess of the prior's constants.
             hidden_sizes: widths of the residual's hidden layers.
+            activation: class of its activation.
             residual_outputs: ``"velocities"`` corrects accelerations alone (positions follow their
                 velocities by definition), ``"all"`` every component of ds/dt, as published.
             integrator: solver name or instance.
@@ -85,7 +87,7 @@ class HybridDynamics(nn.Module):
         return cls(
             task,
             prior=PhysicsPrior(system, constants),
-            residual=ResidualMLP(system, hidden_sizes, outputs),
+            residual=ResidualMLP(system, hidden_sizes, outputs, activation),
             integrator=integrator,
         )
 
@@ -95,10 +97,11 @@ class HybridDynamics(nn.Module):
         task: Task,
         *,
         hidden_sizes: Sequence[int] = (16, 16),
+        activation: type[nn.Module] = nn.ReLU,
         integrator: str | Integrator = "semi_implicit_euler",
     ) -> HybridDynamics:
         """The same transition without F^p."""
-        residual = ResidualMLP(task.system, hidden_sizes)
+        residual = ResidualMLP(task.system, hidden_sizes, activation=activation)
         return cls(task, prior=None, residual=residual, integrator=integrator)
 
     @classmethod

@@ -17,7 +17,6 @@ from phihp_torchrl.dynamics import (
     FitConfig,
     HybridDynamics,
     PhysicsPrior,
-    ResidualMLP,
     fit,
     perturbed_constants,
     rollout_error,
@@ -114,17 +113,22 @@ def make_dynamics(
     """
     if config.kind == "oracle":
         return HybridDynamics.oracle(task)
-    prior = residual = None
-    if config.kind != "data_driven":
-        guess = perturbed_constants(task.system, config.constants_error, generator)
-        prior = PhysicsPrior(task.system, guess)
-    if config.kind != "prior":
-        outputs = None
-        if prior is not None and config.residual_outputs == "velocities":
-            outputs = task.system.velocity_indices or None
-        activation = _ACTIVATIONS[config.activation]
-        residual = ResidualMLP(task.system, config.hidden_sizes, outputs, activation)
-    return HybridDynamics(task, prior=prior, residual=residual, integrator=config.integrator)
+    activation, sizes = _ACTIVATIONS[config.activation], config.hidden_sizes
+    if config.kind == "data_driven":
+        return HybridDynamics.data_driven(
+            task, hidden_sizes=sizes, activation=activation, integrator=config.integrator
+        )
+    guess = perturbed_constants(task.system, config.constants_error, generator)
+    if config.kind == "prior":
+        return HybridDynamics.pure_prior(task, constants=guess, integrator=config.integrator)
+    return HybridDynamics.hybrid(
+        task,
+        constants=guess,
+        hidden_sizes=sizes,
+        activation=activation,
+        residual_outputs=config.residual_outputs,
+        integrator=config.integrator,
+    )
 
 
 class ModelTrainer:
