@@ -286,7 +286,6 @@ def test_first_guess_is_wrong_by_the_error():
 
 
 def test_custom_environment():
-
     env = TransformedEnv(GymWrapper(make_real_env(SHORT).base_env._env), StepCounter())
     trainer = ModelTrainer(SHORT, MODEL, seed=0, env=env)
     trainer.advance()
