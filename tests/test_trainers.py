@@ -14,6 +14,7 @@ from torchrl.envs import GymWrapper, StepCounter, TransformedEnv
 from phihp_torchrl import HybridDynamics, get_task
 from phihp_torchrl.agents import TD3Config, imagined_return
 from phihp_torchrl.dynamics import DynamicsLoss, FitConfig, rollout_error, split
+from phihp_torchrl.planners.factory import make_planner
 from phihp_torchrl.trainers import (
     CollectConfig,
     ModelConfig,
@@ -154,19 +155,24 @@ def test_the_seed_makes_the_run():
 def test_the_planner_collects_from_the_second_iteration_on(monkeypatch):
     made = []
 
-    class Spy(collect_module.CEMPlanner):
-        def __init__(self, *args, **kwargs):
-            super().__init__(*args, **kwargs)
-            made.append(kwargs)
+    def spy(*args, **kwargs):
+        made.append(make_planner(*args, **kwargs))
+        return made[-1]
 
-    monkeypatch.setattr(collect_module, "CEMPlanner", Spy)
+    monkeypatch.setattr(collect_module, "make_planner", spy)
     trainer = ModelTrainer(SHORT, MODEL, seed=0)
     trainer.advance()
     assert made == []
     trainer.advance()
     assert len(made) == 1
-    assert made[0]["replan_every"] == 5
-    assert made[0]["num_candidates"] == 8
+    assert made[0].settings.num_candidates == 8
+    assert made[0].memory is not None, "a plan is acted on for several steps"
+
+
+def test_a_collecting_plan_that_cannot_be_is_refused_at_once():
+    for change in ({"replan_every": 9}, {"top_k": 9}, {"planning_horizon": 0}):
+        with pytest.raises(ValueError, match=next(iter(change))):
+            replace(COLLECT, **{"planning_horizon": 8, "num_candidates": 8, **change})
 
 
 def push_reward(state, action, next_state):

@@ -52,6 +52,16 @@ def q_values(critics: Layers, observation: Tensor, action: Tensor, action_high: 
     return torch.baddbmm(critics[-1].unsqueeze(1), hidden, critics[-2].mT).squeeze(-1)
 
 
+def finite_transition(
+    transition: Transition, state: Tensor, action: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A step of the model; one into non-finite numbers stays put, earns nothing and terminates."""
+    next_state, reward, terminated = transition(state, action)
+    finite = next_state.isfinite().all(-1) & reward.isfinite()
+    next_state = torch.where(finite.unsqueeze(-1), next_state, state)
+    return next_state, torch.where(finite, reward, torch.zeros_like(reward)), terminated | ~finite
+
+
 def td3_target(
     batch: Batch,
     actor: Layers,
@@ -93,7 +103,8 @@ def td3_target(
     for _ in range(expansion - 1):
         if transition is None:
             raise ValueError(f"transition: expected the model for expansion={expansion}, got none.")
-        state, reward, terminated = transition(state, policy(actor, observe(state), action_high))
+        action = policy(actor, observe(state), action_high)
+        state, reward, terminated = finite_transition(transition, state, action)
         value = value + discount * reward
         discount = gamma * discount * (1.0 - terminated.to(value.dtype))
     observation = observe(state)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from phihp_torchrl.agents.functional import Batch, Layers, policy
+from phihp_torchrl.agents.functional import Batch, Layers, finite_transition, policy
 from phihp_torchrl.dynamics import TaskWorldModel
 
 
@@ -91,11 +91,7 @@ def imagine(
         action = action + noise.exploration[t] * action_high
         action = torch.minimum(torch.maximum(action, -action_high), action_high)
         action = torch.where(noise.use_random[t].unsqueeze(-1), noise.random_actions[t], action)
-        next_state, reward, terminated = world_model.transition(state, action)
-        finite = next_state.isfinite().all(-1) & reward.isfinite()
-        next_state = torch.where(finite.unsqueeze(-1), next_state, state)
-        reward = torch.where(finite, reward, torch.zeros_like(reward))
-        terminated = terminated | ~finite
+        next_state, reward, terminated = finite_transition(world_model.transition, state, action)
         rows.append(Batch(state, action, reward, next_state, terminated))
         age = age + 1
         ended = terminated | (age >= max_age)

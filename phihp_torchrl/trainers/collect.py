@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gymnasium
 import torch
@@ -11,8 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
 
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
-from phihp_torchrl.envs import WorldModelEnv
-from phihp_torchrl.planners import CEMPlanner
+from phihp_torchrl.planners.factory import PlannerConfig, make_planner
 from phihp_torchrl.tasks import Task
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -49,6 +49,19 @@ class CollectConfig:
             raise ValueError(f"noise: expected a number >= 0, got {self.noise}.")
         if self.random_hold < 1:
             raise ValueError(f"random_hold: expected a positive number, got {self.random_hold}.")
+        PlannerConfig(**self.plan())  # refuses what the planner would refuse after real steps
+
+    def plan(self) -> dict[str, Any]:
+        """The planner's own arguments: plain CEM, rewards not discounted."""
+        return {
+            "planning_horizon": self.planning_horizon,
+            "optim_steps": self.optim_steps,
+            "num_candidates": self.num_candidates,
+            "top_k": self.top_k,
+            "replan_every": self.replan_every,
+            "num_policy_candidates": 0,
+            "gamma": 1.0,
+        }
 
 
 def make_real_env(task: Task) -> EnvBase:
@@ -82,16 +95,8 @@ def planning_policy(
     """Plain CEM in the model as it is, plus noise in units of the action bounds."""
     if config.exploration_reward and task.exploration_reward is not None:
         task = replace(task, reward=task.exploration_reward)
-    planner = CEMPlanner(
-        WorldModelEnv(TaskWorldModel(task, dynamics), seed=0),
-        planning_horizon=config.planning_horizon,
-        optim_steps=config.optim_steps,
-        num_candidates=config.num_candidates,
-        top_k=config.top_k,
-        gamma=1.0,
-        replan_every=config.replan_every,
-        generator=generator,
-    )
+    model = TaskWorldModel(task, dynamics)
+    planner = make_planner(model, None, None, PlannerConfig(**config.plan()), generator=generator)
     scale = noise * torch.tensor(task.action_high)
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:

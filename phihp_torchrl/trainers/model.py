@@ -49,8 +49,8 @@ class ModelConfig:
         integrator: of the model.
         lambda_0: initial weight λ of the published loss.
         tau_ph: its growth.
-        warm_start: whether a fit between the first and the last starts from the one before, with
-            λ where that ended, and takes at most ``refit_steps``.
+        warm_start: whether a fit starts from the one before. Those between the first and the last
+            then keep λ where it ended, and take at most ``refit_steps``.
         refit_steps: see ``warm_start``.
         fit: how to fit.
         collect: how to collect.

@@ -159,7 +159,7 @@ class PolicyTrainer:
     ) -> None:
         self.task = task
         self.config = config
-        self.world_model = TaskWorldModel(task, dynamics).requires_grad_(False)
+        self.world_model = TaskWorldModel(task, dynamics)
         self.generator = torch.Generator().manual_seed(seed)
         self.start_states = make_start_states(task, **vars(config.start), states=data_states)
         self.loss = make_td3_loss(self.world_model, config.td3)
@@ -172,9 +172,14 @@ class PolicyTrainer:
         self.best_return = -math.inf
         self.updates = 0
         self.seconds = 0.0
-        episodes = config.evaluation_episodes + config.real_evaluation_episodes
-        self._evaluation_states = task.reset.sample([episodes], generator=self.generator)
+        self._evaluation_states = task.reset.sample(
+            [config.evaluation_episodes], generator=self.generator
+        )
+        # The world's episodes have a generator of their own: the log has no part in the training.
         self._world = TaskWorldModel(task, HybridDynamics.oracle(task))
+        self._world_states = task.reset.sample(
+            [config.real_evaluation_episodes], generator=torch.Generator().manual_seed(seed)
+        )
 
     @property
     def max_age(self) -> int:
@@ -207,9 +212,7 @@ class PolicyTrainer:
                 if self.updates % config.td3.policy_delay == 0:
                     losses = self._learn()
                 self.updates += 1
-        imagined = self._play(
-            self.world_model, self._evaluation_states[: config.evaluation_episodes]
-        )
+        imagined = self._play(self.world_model, self._evaluation_states)
         if imagined > self.best_return:
             self.best_return = imagined
             for kept, layer in zip(self.best, self._layers(), strict=True):
@@ -222,8 +225,7 @@ class PolicyTrainer:
             **{f"policy/{name}": value.item() for name, value in losses.items()},
         }
         if config.real_evaluation_episodes:
-            states = self._evaluation_states[config.evaluation_episodes :]
-            metrics["policy/real_return"] = self._play(self._world, states)
+            metrics["policy/real_return"] = self._play(self._world, self._world_states)
         self.seconds += time.perf_counter() - start
         return {**metrics, "policy/seconds": self.seconds}
 
@@ -251,6 +253,7 @@ class PolicyTrainer:
             "updates": self.updates,
             "seconds": self.seconds,
             "evaluation_states": self._evaluation_states,
+            "world_states": self._world_states,
             "generator": self.generator.get_state(),
         }
 
@@ -265,6 +268,7 @@ class PolicyTrainer:
         self.updates = state["updates"]
         self.seconds = state["seconds"]
         self._evaluation_states = state["evaluation_states"]
+        self._world_states = state["world_states"]
         self.generator.set_state(state["generator"])
 
     def _play(self, world_model: TaskWorldModel, states: Tensor) -> float:
