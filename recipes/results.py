@@ -145,7 +145,10 @@ def origins(runs: list[Run]) -> str:
     """Where the figures come from."""
     commits = ", ".join(sorted({run.commit for run in runs}))
     machines = "; ".join(sorted({run.machine for run in runs}))
-    return f"Commits: {commits}. Machine: {machines}; one thread a run, two runs at a time."
+    return (
+        f"Commits: {commits}. Machine: {machines}, shared with other work; one thread a run, "
+        "so times are upper bounds."
+    )
 
 
 def main() -> None:
