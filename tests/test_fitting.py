@@ -31,12 +31,13 @@ def transitions(task, count, seed=0):
     return TensorDict(observation=observe(state), action=action, next=following, batch_size=[count])
 
 
-def make_loss(task, kind="hybrid", seed=0, **options):
+def make_loss(task, kind="hybrid", seed=0, model_options=None, **options):
     torch.manual_seed(seed)
     guess = perturbed_constants(task.system, 0.3, generator(seed))
     if kind == "data_driven":
         return DynamicsLoss(HybridDynamics.data_driven(task), **options)
-    return DynamicsLoss(getattr(HybridDynamics, kind)(task, constants=guess), **options)
+    dynamics = getattr(HybridDynamics, kind)(task, constants=guess, **(model_options or {}))
+    return DynamicsLoss(dynamics, **options)
 
 
 def parameters(loss):
@@ -105,6 +106,25 @@ def test_friction_goes_to_the_residual():
     explained = dynamics.residual(state, action)[:, 1]
     correlation = torch.corrcoef(torch.stack([explained, system.friction(state, action)[:, 1]]))
     assert correlation[0, 1] > 0.95
+
+
+def test_shuffled_actions_keep_friction_apart_from_torque():
+    # A swinging-up controller pushes along the velocity, just as friction pulls against it.
+    draws = generator(3)
+    state = PENDULUM.coverage.sample([500], generator=draws)
+    action = state[:, 1:].sign() + torch.randn(500, 1, generator=draws)
+    observe = PENDULUM.system.observe
+    following = TensorDict(observation=observe(PENDULUM.step(state, action)), batch_size=[500])
+    data = TensorDict(observation=observe(state), action=action, next=following, batch_size=[500])
+    truth = PENDULUM.system.identifiable(PENDULUM.system.constants)["torque_gain"]
+
+    def error(shuffle):
+        loss = make_loss(PENDULUM, model_options={"activation": torch.nn.Tanh})
+        fit(loss, data[:400], data[400:], FitConfig(shuffle_actions=shuffle), generator())
+        identified = PENDULUM.system.identifiable(loss.dynamics.prior.constants())
+        return abs(identified["torque_gain"].item() / truth - 1)
+
+    assert error(shuffle=True) < 0.5 * error(shuffle=False)
 
 
 def test_data_driven_model_is_fitted_too():

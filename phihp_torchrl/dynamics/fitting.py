@@ -33,6 +33,9 @@ class FitConfig:
         final_lambda: where it ends.
         patience: Levenberg-Marquardt stops after this many steps, at its final lambda, that did not
             improve the held-out error by a tenth.
+        shuffle_actions: whether Levenberg-Marquardt's penalty takes each state with the action of
+            another transition. A controller's actions go with the velocities, so the smallest F^r
+            on the pairs as they came would explain friction by a wrong effect of the action.
     """
 
     method: str = "levenberg_marquardt"
@@ -44,6 +47,7 @@ class FitConfig:
     initial_lambda: float = 1e-2
     final_lambda: float = 1e7
     patience: int = 8
+    shuffle_actions: bool = False
 
     def __post_init__(self) -> None:
         if self.method not in ("levenberg_marquardt", "adam"):
@@ -152,10 +156,15 @@ def _levenberg_marquardt(
 
     .. math:: (J^\top J + \mu\,\mathrm{diag}\,J^\top J)\,\delta = -J^\top r
 
-    The penalty is squared here, where the paper's is a norm, because the method needs squares.
+    The penalty is squared here, where the paper's is a norm, because the method needs squares; and
+    F^r is penalised at shuffled actions (``config.shuffle_actions``).
     """
     system = _LeastSquares(loss)
-    data = loss.transitions(train)
+    transitions = loss.transitions(train)
+    penalised_action = transitions[1]
+    if config.shuffle_actions:
+        order = torch.randperm(len(penalised_action), generator=generator)
+        penalised_action = penalised_action[order]
     reference = loss.transitions(held_out)
     theta = system.parameters()
     damping = 1e-2
@@ -168,10 +177,10 @@ def _levenberg_marquardt(
     stale, steps = 0, 0
     while steps < config.steps:
         steps += 1
-        rows: tuple[Tensor, ...] = data
+        rows: tuple[Tensor, ...] = (*transitions, penalised_action)
         if config.batch_size is not None and config.batch_size < len(train):
             index = torch.randint(len(train), (config.batch_size,), generator=generator)
-            rows = tuple(part[index] for part in data)
+            rows = tuple(part[index] for part in rows)
         theta, damping, improved = system.step(theta, rows, damping)
         error = system.prediction_error(theta, reference)
         stale = 0 if error < 0.9 * best_error else stale + 1
@@ -192,8 +201,9 @@ class _LeastSquares:
         self.loss = loss
         self.named = dict(loss.named_parameters())
         self.sizes = [p.numel() for p in self.named.values()]
-        self._rows = vmap(self._row, (None, 0, 0, 0))
-        self._jacobian = vmap(jacrev(self._row), (None, 0, 0, 0))
+        self._errors = vmap(self._error, (None, 0, 0, 0))
+        self._rows = vmap(self._row, (None, 0, 0, 0, 0))
+        self._jacobian = vmap(jacrev(self._row), (None, 0, 0, 0, 0))
 
     def parameters(self) -> Tensor:
         return torch.cat([p.detach().reshape(-1) for p in self.named.values()])
@@ -206,17 +216,19 @@ class _LeastSquares:
         parts = zip(self.named.items(), theta.split(self.sizes), strict=True)
         return {name: part.reshape(p.shape) for (name, p), part in parts}
 
-    def _row(self, theta: Tensor, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        error, residual = functional_call(
-            _Terms(self.loss),
-            {f"loss.{name}": value for name, value in self._unpack(theta).items()},
-            (state, action, next_state),
-        )
+    def _terms(self, theta: Tensor, *transition: Tensor) -> tuple[Tensor, Tensor]:
+        parameters = {f"loss.{name}": value for name, value in self._unpack(theta).items()}
+        return functional_call(_Terms(self.loss), parameters, transition)
+
+    def _error(self, theta: Tensor, *transition: Tensor) -> Tensor:
+        return self._terms(theta, *transition)[0]
+
+    def _row(self, theta: Tensor, *transition: Tensor) -> Tensor:
+        error, residual = self._terms(theta, *transition)
         return torch.cat([error, residual / self.loss.lambda_.sqrt()])
 
-    def prediction_error(self, theta: Tensor, rows: tuple[Tensor, ...]) -> float:
-        n = rows[0].shape[-1]
-        return self._rows(theta, *rows)[:, :n].square().sum(-1).mean().item()
+    def prediction_error(self, theta: Tensor, transitions: tuple[Tensor, ...]) -> float:
+        return self._errors(theta, *transitions).square().sum(-1).mean().item()
 
     def step(
         self, theta: Tensor, rows: tuple[Tensor, ...], damping: float
@@ -244,5 +256,5 @@ class _Terms(torch.nn.Module):
         super().__init__()
         self.loss = loss
 
-    def forward(self, state: Tensor, action: Tensor, next_state: Tensor) -> tuple[Tensor, Tensor]:
-        return self.loss.terms(state, action, next_state)
+    def forward(self, *transition: Tensor) -> tuple[Tensor, Tensor]:
+        return self.loss.terms(*transition)

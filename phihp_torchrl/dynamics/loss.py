@@ -115,11 +115,21 @@ class DynamicsLoss(LossModule):
         state = locate(tensordict.get(keys.observation))
         return state, tensordict.get(keys.action), locate(next_observation)
 
-    def terms(self, state: Tensor, action: Tensor, next_state: Tensor) -> tuple[Tensor, Tensor]:
-        """What the two losses measure, scaled: ``s' - ŝ'`` and F^r, each ``[*batch, n]``."""
+    def terms(
+        self,
+        state: Tensor,
+        action: Tensor,
+        next_state: Tensor,
+        penalised_action: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """What the two losses measure, scaled: ``s' - ŝ'`` and F^r, each ``[*batch, n]``.
+
+        F^r is taken at ``state`` and ``penalised_action`` ``[*batch, m]``, by default ``action``.
+        """
         error = self.prediction_error(state, action, next_state) / self.error_scale
         if self.dynamics.residual is None:
             return error, torch.zeros_like(error)
+        action = action if penalised_action is None else penalised_action
         return error, self.dynamics.residual(state, action) / self.residual_scale
 
     def prediction_error(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
