@@ -17,6 +17,7 @@ from phihp_torchrl.agents import (
     Batch,
     ChunkNoise,
     FlatReplay,
+    Imagination,
     Worlds,
     draw_noise,
     imagine,
@@ -237,7 +238,44 @@ def test_a_chunk_is_one_graph():
             torch.testing.assert_close(one, other)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pendulum", "acrobot-swingup"])
+def test_compiled_by_inductor_equals_eager(name):
+    model, actor, high = make(name)
+    eager, compiled = (Imagination(model, high, 3, compile=c) for c in (False, True))
+    worlds = start(model)
+    with torch.no_grad(), torch._dynamo.config.patch(error_on_recompile=True):
+        for _ in range(2):
+            noise = draw_noise(
+                model.task.reset.sample([STEPS, WORLDS]), high, std=0.1, random_fraction=0.2
+            )
+            expected = eager.chunk(actor, worlds, noise)
+            torch.testing.assert_close(compiled.chunk(actor, worlds, noise), expected)
+            worlds = expected[1]
+            # 12 steps: two compiled chunks and a rest.
+            returns = (x.returns(actor, worlds.state, 12) for x in (compiled, eager))
+            torch.testing.assert_close(*returns, rtol=1e-4, atol=1e-4)
+            actor[0].mul_(0.9)
+
+
+def test_what_cannot_compile_says_so(caplog):
+    task = get_task("pendulum")
+    model = TaskWorldModel(task, HybridDynamics.oracle(task, integrator="dopri5"))
+    imagination = Imagination(model, torch.tensor([2.0]), 3, compile=True)
+    assert "not compiled" in caplog.text
+    actor = [p.detach() for p in Actor(task, (4,)).mlp.parameters()]
+    assert imagination.returns(actor, task.reset.sample([2]), 6).shape == (2,)
+
+
 # Returns
+
+
+@pytest.mark.parametrize("steps", [3, 5, 13])
+def test_returns_in_chunks_are_the_whole(steps):
+    model, actor, high = make("cartpole")
+    state = model.task.coverage.sample([20])
+    values = Imagination(model, high, 9).returns(actor, state, steps)
+    assert torch.equal(values, imagined_return(model, actor, state, high, steps))
 
 
 @pytest.mark.parametrize("name", list_tasks())

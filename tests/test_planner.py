@@ -896,6 +896,11 @@ def test_what_cannot_compile_says_so(caplog):
         make_planner(PendulumEnv(), compile=True)
     assert caplog.records[0].levelname == "WARNING"
     assert "which is not compiled" in caplog.records[0].getMessage()
+    task = get_task("pendulum")
+    model = TaskWorldModel(task, HybridDynamics.oracle(task, integrator="dopri5"))
+    planner = make_planner(WorldModelEnv(model), compile=True)
+    assert "integrator does not compile" in caplog.records[1].getMessage()
+    assert planner.plan(TensorDict(observation=torch.tensor([1.0, 0.0, 0.0]))).score.isfinite()
 
 
 # Bad input.

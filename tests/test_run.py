@@ -522,3 +522,31 @@ def test_tensorboard_logs_and_forgets(tmp_path: Path) -> None:
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     assert [event.step for event in events.Scalars("x")] == list(range(6))
+
+
+# Compiled
+
+
+def test_no_graph_breaks_and_none_is_compiled_twice(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A whole run; a break would fail it, for every graph is a full one."""
+    compile = torch.compile
+
+    def aot_compile(function: Any, *, fullgraph: bool, dynamic: bool, **_: Any) -> Any:
+        return compile(function, fullgraph=fullgraph, dynamic=dynamic, backend="aot_eager")
+
+    monkeypatch.setattr(torch, "compile", aot_compile)
+    torch._dynamo.reset()
+    torch._dynamo.utils.counters.clear()
+    config = replace(CONFIG, compile=True, evaluate=replace(CONFIG.evaluate, latency_actions=2))
+    with torch._dynamo.config.patch(error_on_recompile=True):
+        assert run(config, tmp_path / "compiled").finished
+    counters = torch._dynamo.utils.counters
+    assert not counters["graph_break"]
+    # The TD3 step, imagined chunks, returns in model and world, and plans for 2 worlds and for one.
+    assert counters["stats"]["unique_graphs"] == 6
+    for ours, eager in zip(rows(tmp_path / "compiled"), rows(whole), strict=True):
+        for key, value in eager.items():
+            if value and key != "phase":
+                assert float(ours[key]) == pytest.approx(float(value), rel=1e-3, abs=1e-3), key

@@ -17,6 +17,7 @@ from phihp_torchrl.agents import Batch, TD3Config, TD3Update, make_td3_loss
 from phihp_torchrl.agents.functional import (
     actor_loss,
     adam_,
+    adam_rates,
     critic_loss,
     policy,
     q_values,
@@ -319,7 +320,7 @@ def test_adam_is_torchs(rate):
         for param, grad in zip(reference, grads, strict=True):
             param.grad = grad.clone()
         optimizer.step()
-        adam_(params, grads, means, squares, torch.tensor(float(step)), torch.tensor(rate))
+        adam_(params, grads, means, squares, *adam_rates(torch.tensor(step), rate))
         for param, expected in zip(params, reference, strict=True):
             torch.testing.assert_close(param, expected.detach(), rtol=1e-5, atol=1e-4 * rate)
     for param, mean, square in zip(reference, means, squares, strict=True):
@@ -410,6 +411,36 @@ def test_a_step_is_one_graph(expansion):
         update.state_dict().values(), compiled.state_dict().values(), strict=True
     ):
         torch.testing.assert_close(one, other)
+
+
+@pytest.mark.slow
+def test_compiled_by_inductor_equals_eager():
+    # Wide enough for oneDNN, which sums in another order.
+    wide = replace(SMALL, actor_hidden_sizes=(96, 96), critic_hidden_sizes=(96, 96))
+    update = make_update(wide, compile=True)
+    eager = make_update(wide)
+    eager.load_state_dict(copy.deepcopy(update.state_dict()))
+    with torch._dynamo.config.patch(error_on_recompile=True):
+        for seed in range(3):
+            batch = make_batch(update.world_model, 256)
+            losses = update(batch, generator=torch.Generator().manual_seed(seed))
+            expected = eager(batch, generator=torch.Generator().manual_seed(seed))
+            torch.testing.assert_close(losses, expected, rtol=1e-4, atol=1e-5)
+    for one, other in zip(update.state_dict().values(), eager.state_dict().values(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+
+
+def test_a_copy_trains_apart():
+    update = make_update()
+    batch = make_batch(update.world_model, 16)
+    update(batch)
+    copied = copy.deepcopy(update)
+    before = copies(update)
+    copied(batch)
+    assert same(before["actor"], copies(update)["actor"])
+    assert not same(before["actor"], copies(copied)["actor"])
+    update.double()
+    assert update.networks.actor[0].dtype == torch.float64, "looked up anew"
 
 
 # Learning

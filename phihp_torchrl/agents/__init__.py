@@ -5,6 +5,7 @@ from __future__ import annotations
 from phihp_torchrl.agents.functional import Batch
 from phihp_torchrl.agents.imagination import (
     ChunkNoise,
+    Imagination,
     Worlds,
     draw_noise,
     imagine,
@@ -26,6 +27,7 @@ __all__ = [
     "Batch",
     "ChunkNoise",
     "FlatReplay",
+    "Imagination",
     "QNetwork",
     "TD3Config",
     "TD3Update",

@@ -34,22 +34,24 @@ class Batch(NamedTuple):
     """bool ``[N]``."""
 
 
+def mlp(layers: Layers, inputs: Tensor) -> Tensor:
+    """A network with ReLU between its layers, ``[N, in] -> [N, out]``."""
+    for i in range(0, len(layers) - 2, 2):
+        inputs = F.linear(inputs, layers[i], layers[i + 1]).relu()
+    return F.linear(inputs, layers[-2], layers[-1])
+
+
 def policy(actor: Layers, observation: Tensor, action_high: Tensor) -> Tensor:
     """The actor: ``[N, o] -> [N, m]``, physical units."""
-    hidden = observation
-    for i in range(0, len(actor) - 2, 2):
-        hidden = F.linear(hidden, actor[i], actor[i + 1]).relu()
-    return F.linear(hidden, actor[-2], actor[-1]).tanh() * action_high
+    return mlp(actor, observation).tanh() * action_high
 
 
 def q_values(critics: Layers, observation: Tensor, action: Tensor, action_high: Tensor) -> Tensor:
-    """All critics at once: ``[N, o], [N, m] -> [critics, N]``."""
+    """All critics: ``[N, o], [N, m] -> [critics, N]``."""
     inputs = torch.cat([observation, action / action_high], -1)
-    hidden = inputs.expand(critics[0].shape[0], *inputs.shape)
-    for i in range(0, len(critics) - 2, 2):
-        weight, bias = critics[i], critics[i + 1]
-        hidden = torch.baddbmm(bias.unsqueeze(1), hidden, weight.mT).relu()
-    return torch.baddbmm(critics[-1].unsqueeze(1), hidden, critics[-2].mT).squeeze(-1)
+    # One by one: batched products are no faster at these sizes, and leave no room for fusion.
+    apart = zip(*(layer.unbind() for layer in critics), strict=True)
+    return torch.stack([mlp(critic, inputs).squeeze(-1) for critic in apart])
 
 
 def finite_transition(
@@ -128,15 +130,32 @@ def actor_loss(actor: Layers, critics: Layers, observation: Tensor, action_high:
     return -q_values(first, observation, action, action_high).mean()
 
 
+ADAM_BETAS = (0.9, 0.999)
+"""Decay of Adam's first and second moments."""
+
+
+def adam_rates(step: Tensor, learning_rate: float, eps: float = 1e-8) -> tuple[Tensor, Tensor]:
+    """The two scalars of a step of Adam that do not depend on the gradient.
+
+    They are apart from :func:`adam_` to be computed once a step rather than once an element.
+
+    Args:
+        step: number of this step, from 1, any shape.
+        learning_rate: learning rate.
+        eps: what :class:`torch.optim.Adam` adds to the denominator.
+
+    Returns:
+        Size of the step and what to add to the root of the second moment, float32.
+    """
+    step = step.to(torch.float64)
+    beta1, beta2 = ADAM_BETAS
+    root = (1.0 - beta2**step).sqrt()
+    size = learning_rate * root / (1.0 - beta1**step)
+    return size.to(torch.float32), (eps * root).to(torch.float32)
+
+
 def adam_(
-    params: Layers,
-    grads: Layers,
-    means: Layers,
-    squares: Layers,
-    step: Tensor,
-    learning_rate: Tensor,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-8,
+    params: Layers, grads: Layers, means: Layers, squares: Layers, size: Tensor, eps: Tensor
 ) -> None:
     """One step of Adam in place, as :class:`torch.optim.Adam` defines it.
 
@@ -145,18 +164,14 @@ def adam_(
         grads: gradients.
         means: first moments, changed in place.
         squares: second moments, changed in place.
-        step: number of this step, from 1, scalar.
-        learning_rate: scalar.
-        betas: decay of the moments.
-        eps: added to the denominator.
+        size: scalar of :func:`adam_rates`.
+        eps: scalar of :func:`adam_rates`.
     """
-    beta1, beta2 = betas
-    size = learning_rate / (1.0 - beta1**step)
-    root = (1.0 - beta2**step).sqrt()
+    beta1, beta2 = ADAM_BETAS
     for param, grad, mean, square in zip(params, grads, means, squares, strict=True):
         mean.lerp_(grad, 1.0 - beta1)
         square.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)
-        param.sub_(size * mean / (square.sqrt() / root + eps))
+        param.sub_(size * mean / (square.sqrt() + eps))
 
 
 def soft_update_(targets: Layers, sources: Layers, tau: float) -> None:

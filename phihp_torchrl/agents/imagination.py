@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import logging
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from phihp_torchrl.agents.functional import Batch, Layers, finite_transition, policy
+from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.dynamics import TaskWorldModel
+
+_logger = logging.getLogger(__name__)
 
 
 class Worlds(NamedTuple):
@@ -101,15 +106,91 @@ def imagine(
     return batch, Worlds(state, age)
 
 
-def imagined_return(
-    world_model: TaskWorldModel, actor: Layers, state: Tensor, action_high: Tensor, steps: int
-) -> Tensor:
-    """Undiscounted return of the noise-free policy from each state ``[N, n]``, ``[N]``."""
-    total = torch.zeros_like(state[..., 0])
-    alive = torch.ones_like(total)
+class Returns(NamedTuple):
+    """Episodes of which the returns are being summed."""
+
+    state: Tensor
+    """Where they are, ``[N, n]``."""
+    total: Tensor
+    """Undiscounted rewards so far, ``[N]``."""
+    alive: Tensor
+    """1 where the episode goes on, else 0, ``[N]``."""
+
+    @classmethod
+    def from_state(cls, state: Tensor) -> Returns:
+        """Episodes that start in ``state``."""
+        return cls(state, torch.zeros_like(state[..., 0]), torch.ones_like(state[..., 0]))
+
+
+def sum_rewards(
+    world_model: TaskWorldModel, actor: Layers, returns: Returns, action_high: Tensor, steps: int
+) -> Returns:
+    """Go on for ``steps`` steps of the noise-free policy."""
+    state, total, alive = returns
     for _ in range(steps):
         action = policy(actor, world_model.observe(state), action_high)
         state, reward, terminated = world_model.transition(state, action)
         total = total + alive * reward
         alive = alive * (1.0 - terminated.to(alive.dtype))
-    return total
+    return Returns(state, total, alive)
+
+
+def imagined_return(
+    world_model: TaskWorldModel, actor: Layers, state: Tensor, action_high: Tensor, steps: int
+) -> Tensor:
+    """Undiscounted return of the noise-free policy from each state ``[N, n]``, ``[N]``."""
+    return sum_rewards(world_model, actor, Returns.from_state(state), action_high, steps).total
+
+
+class Imagination:
+    """A world model for one task's policy to act in: chunks of transitions, and returns.
+
+    Args:
+        world_model: the model; later changes of its parameters are seen at once.
+        action_high: action bounds ``[m]``.
+        max_age: steps a world lives at most.
+        compile: whether to compile, chunk by chunk (10 to 40 s at first, from the cache
+            afterwards). Where the model does not compile, it is left out with a warning.
+
+    Examples:
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> from phihp_torchrl.agents import Actor
+        >>> task = get_task("pendulum")
+        >>> imagination = Imagination(
+        ...     TaskWorldModel(task, HybridDynamics.oracle(task)), torch.tensor([2.0]), max_age=200
+        ... )
+        >>> layers = [layer.detach() for layer in Actor(task).mlp.parameters()]
+        >>> imagination.returns(layers, task.reset.sample([3]), steps=200).shape
+        torch.Size([3])
+    """
+
+    # A compiled chunk of returns: long enough to make its call cheap, short to compile.
+    _RETURN_STEPS = 5
+
+    def __init__(
+        self,
+        world_model: TaskWorldModel,
+        action_high: Tensor,
+        max_age: int,
+        *,
+        compile: bool = False,
+    ) -> None:
+        if compile and not world_model.compiles:
+            _logger.warning("Imagination is not compiled: the model's integrator does not compile.")
+            compile = False
+        self.action_high = action_high
+        self.max_age = max_age
+        self._imagine = compile_graph(partial(imagine, world_model), enabled=compile)
+        self._sum_rewards = partial(sum_rewards, world_model)
+        self._sum_rewards_chunk = compile_graph(self._sum_rewards, enabled=compile)
+
+    def chunk(self, actor: Layers, worlds: Worlds, noise: ChunkNoise) -> tuple[Batch, Worlds]:
+        """Step all worlds through a chunk: :func:`imagine`."""
+        return self._imagine(actor, worlds, noise, self.action_high, self.max_age)
+
+    def returns(self, actor: Layers, state: Tensor, steps: int) -> Tensor:
+        """Undiscounted return of the noise-free policy from each state ``[N, n]``, ``[N]``."""
+        returns, size = Returns.from_state(state), self._RETURN_STEPS
+        for _ in range(steps // size):
+            returns = self._sum_rewards_chunk(actor, returns, self.action_high, size)
+        return self._sum_rewards(actor, returns, self.action_high, steps % size).total

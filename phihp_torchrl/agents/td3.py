@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -13,12 +15,29 @@ from phihp_torchrl.agents.functional import (
     Batch,
     actor_loss,
     adam_,
+    adam_rates,
     critic_loss,
     soft_update_,
     td3_target,
 )
 from phihp_torchrl.agents.networks import make_actor, make_qvalue
+from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.dynamics import TaskWorldModel
+
+_logger = logging.getLogger(__name__)
+
+
+class Networks(NamedTuple):
+    """All that a step changes: layers, each group ``[weight, bias, …]``."""
+
+    actor: list[Tensor]
+    critics: list[Tensor]
+    target_actor: list[Tensor]
+    target_critics: list[Tensor]
+    actor_means: list[Tensor]
+    actor_squares: list[Tensor]
+    critic_means: list[Tensor]
+    critic_squares: list[Tensor]
 
 
 @dataclass(frozen=True)
@@ -118,13 +137,16 @@ class TD3Update(nn.Module):
         self.loss = loss
         self.world_model = world_model
         self.config = config
-        for name in ("actor", "critics"):
-            for i, layer in enumerate(getattr(self, name)):
+        self._networks: Networks | None = None
+        for name, group in (("actor", self.actor), ("critics", self.critics)):
+            for i, layer in enumerate(group):
                 self.register_buffer(f"{name}_mean_{i}", torch.zeros_like(layer))
                 self.register_buffer(f"{name}_square_{i}", torch.zeros_like(layer))
         self.register_buffer("steps", torch.zeros((), dtype=torch.float64))
-        step = self._step
-        self._compiled_step = torch.compile(step, fullgraph=True) if compile else step
+        if compile and config.value_expansion > 1 and not world_model.compiles:
+            _logger.warning("TD3 is not compiled: the model's integrator does not compile.")
+            compile = False
+        self._compiled_step = compile_graph(self._step, enabled=compile)
 
     @property
     def actor(self) -> list[Tensor]:
@@ -136,10 +158,29 @@ class TD3Update(nn.Module):
         """The critics' stacked layers, the loss's own tensors."""
         return layers(self.loss.qvalue_network_params)
 
-    def _moments(self, name: str) -> tuple[list[Tensor], list[Tensor]]:
-        count = len(getattr(self, name))
-        means = [getattr(self, f"{name}_mean_{i}") for i in range(count)]
-        return means, [getattr(self, f"{name}_square_{i}") for i in range(count)]
+    @property
+    def networks(self) -> Networks:
+        """Layers, targets and moments, looked up once: there are more than fifty of them."""
+        if self._networks is None:
+            self._networks = Networks(
+                self.actor,
+                self.critics,
+                layers(self.loss.target_actor_network_params),
+                layers(self.loss.target_qvalue_network_params),
+                *(
+                    [getattr(self, f"{name}_{moment}_{i}") for i in range(len(group))]
+                    for name, group in (("actor", self.actor), ("critics", self.critics))
+                    for moment in ("mean", "square")
+                ),
+            )
+        return self._networks
+
+    def _apply(self, *args: Any, **kwargs: Any) -> TD3Update:
+        self._networks = None  # they may move
+        return super()._apply(*args, **kwargs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_networks": None}  # a copy has its own
 
     @torch.no_grad()
     def forward(
@@ -171,18 +212,17 @@ class TD3Update(nn.Module):
         high = self.loss.max_action
         noise = torch.randn(batch.action.shape, generator=generator, device=high.device)
         clip = config.target_noise_clip
+        updates = torch.arange(1, config.policy_delay + 1, device=high.device)
         loss_qvalue, loss_actor = self._compiled_step(
             batch,
             (config.target_noise * noise).clamp(-clip, clip) * high,
-            torch.tensor(learning_rate_scale, dtype=torch.float32, device=high.device),
-            self.steps,
-            self.actor,
-            self.critics,
-            layers(self.loss.target_actor_network_params),
-            layers(self.loss.target_qvalue_network_params),
-            self._moments("actor"),
-            self._moments("critics"),
+            adam_rates(self.steps + 1, learning_rate_scale * config.actor_learning_rate),
+            adam_rates(
+                self.steps * config.policy_delay + updates,
+                learning_rate_scale * config.critic_learning_rate,
+            ),
             high,
+            self.networks,
         )
         self.steps += 1
         return {"loss_qvalue": loss_qvalue, "loss_actor": loss_actor}
@@ -191,23 +231,17 @@ class TD3Update(nn.Module):
         self,
         batch: Batch,
         noise: Tensor,
-        scale: Tensor,
-        steps: Tensor,
-        actor: list[Tensor],
-        critics: list[Tensor],
-        target_actor: list[Tensor],
-        target_critics: list[Tensor],
-        actor_moments: tuple[list[Tensor], list[Tensor]],
-        critic_moments: tuple[list[Tensor], list[Tensor]],
+        actor_rates: tuple[Tensor, Tensor],
+        critic_rates: tuple[Tensor, Tensor],
         high: Tensor,
+        nets: Networks,
     ) -> tuple[Tensor, Tensor]:
         config, observe = self.config, self.world_model.observe
-        steps = steps.to(torch.float32)
         # The targets stand still until the soft update, so all batches share one pass for them.
         target = td3_target(
             batch,
-            target_actor,
-            target_critics,
+            nets.target_actor,
+            nets.target_critics,
             noise,
             high,
             config.gamma,
@@ -219,17 +253,16 @@ class TD3Update(nn.Module):
         for i, (state, action, value) in enumerate(zip(*parts, strict=True)):
             observation = observe(state)
             gradients, loss_qvalue = torch.func.grad_and_value(critic_loss)(
-                critics, observation, action, value, high
+                nets.critics, observation, action, value, high
             )
-            count = steps * config.policy_delay + (i + 1)
-            rate = scale * config.critic_learning_rate
-            adam_(critics, gradients, *critic_moments, count, rate)
+            rates = (rate[i] for rate in critic_rates)
+            adam_(nets.critics, gradients, nets.critic_means, nets.critic_squares, *rates)
         gradients, loss_actor = torch.func.grad_and_value(actor_loss)(
-            actor, critics, observation, high
+            nets.actor, nets.critics, observation, high
         )
-        adam_(actor, gradients, *actor_moments, steps + 1, scale * config.actor_learning_rate)
-        soft_update_(target_actor, actor, config.tau)
-        soft_update_(target_critics, critics, config.tau)
+        adam_(nets.actor, gradients, nets.actor_means, nets.actor_squares, *actor_rates)
+        soft_update_(nets.target_actor, nets.actor, config.tau)
+        soft_update_(nets.target_critics, nets.critics, config.tau)
         return loss_qvalue, loss_actor
 
 

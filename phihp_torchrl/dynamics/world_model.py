@@ -54,6 +54,12 @@ class TaskWorldModel(WorldModel):
         )
         self.task = task
 
+    @property
+    def compiles(self) -> bool:
+        """Whether :meth:`transition` compiles as one graph, as all but adaptive integrators do."""
+        integrator = getattr(self.dynamics.module, "integrator", None)
+        return integrator is None or integrator.compiles
+
     def locate(self, observation: Tensor) -> Tensor:
         """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""
         return self.task.system.locate(observation)

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MPCPlannerBase
 
+from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.planners.core import Plan, plan
 from phihp_torchrl.planners.env_model import (
     EnvModel,
@@ -93,7 +94,8 @@ class CEMPlanner(MPCPlannerBase):
             the planner forget. Without it, call :meth:`reset`.
         backend: ``"tensor"``, ``"env"``, or ``"auto"`` for the first where it can be.
         compile: whether to compile the plan as one full graph; a dict is passed to
-            :func:`torch.compile`. Needs the tensor backend and is left out otherwise.
+            :func:`torch.compile`. Needs the tensor backend and a model whose integrator compiles,
+            and is left out otherwise. Each batch size is a graph of its own.
         generator: source of the noise, on the environment's device. Defaults to torch's global one.
 
     Raises:
@@ -188,7 +190,8 @@ class CEMPlanner(MPCPlannerBase):
             self.in_keys = list(dict.fromkeys([self.observation_key, *self._module_keys()]))
         self._expected = {key: situation[key] for key in self.in_keys}
         self._compile = compile
-        self._planning_function: Callable[..., Plan] | None = None
+        # One for each batch size, and one with and one without a mean: compiled, each is a graph.
+        self._planning_functions: dict[tuple[torch.Size, bool], Callable[..., Plan]] = {}
 
     # Construction: what fits together.
 
@@ -233,6 +236,10 @@ class CEMPlanner(MPCPlannerBase):
                 ", which is not compiled" if compile else "",
                 reason or "backend='env'",
             )
+        elif compile and not getattr(self.env.tensor_model, "compiles", True):
+            _logger.warning("CEMPlanner is not compiled: the model's integrator does not compile.")
+            compile = False
+        self._compiles = compile and self.uses_tensors
 
     def _make_memory(self, replan_every: int, warm_start: bool) -> PlanMemory | None:
         s = self.settings
@@ -294,17 +301,15 @@ class CEMPlanner(MPCPlannerBase):
         bounds = ActionBounds.from_limits(self._action_low, self._action_high)
         problem = Problem(model=model, bounds=bounds, actor=actor, value=value)
         function = partial(plan, problem=problem, settings=self.settings)
-        if self._compile and self.uses_tensors:
-            options = dict(self._compile) if isinstance(self._compile, dict) else {}
-            return torch.compile(function, **{"fullgraph": True, **options})
-        return function
+        options = dict(self._compile) if isinstance(self._compile, dict) else {}
+        return compile_graph(function, enabled=self._compiles, **options)
 
     def __getstate__(self) -> dict[str, Any]:
-        # The function holds on to these very modules, so a copy builds its own.
-        return {**super().__getstate__(), "_planning_function": None}
+        # The functions hold on to these very modules, so a copy builds its own.
+        return {**super().__getstate__(), "_planning_functions": {}}
 
     def _apply(self, *args: Any, **kwargs: Any) -> CEMPlanner:
-        self._planning_function = None  # it holds the bounds as they were
+        self._planning_functions = {}  # they hold the bounds as they were
         return super()._apply(*args, **kwargs)
 
     # Planning.
@@ -367,14 +372,15 @@ class CEMPlanner(MPCPlannerBase):
             noise = torch.randn(shape, generator=self.generator, dtype=low.dtype, device=low.device)
         elif noise.shape != shape:
             raise ValueError(f"noise: expected shape {list(shape)}, got {list(noise.shape)}.")
-        if self._planning_function is None:
-            self._planning_function = self._build()
+        shapes = (batch, mean is None)
+        if shapes not in self._planning_functions:
+            self._planning_functions[shapes] = self._build()
         if self.uses_tensors:
             observation = tensordict.get(self.observation_key)
         else:
             observation = tensordict.select(*self.in_keys)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return self._planning_function(observation, noise, mean)
+            return self._planning_functions[shapes](observation, noise, mean)
 
     def _check_observation(self, tensordict: TensorDictBase) -> None:
         batch, device = tensordict.batch_size, self._action_low.device

@@ -158,6 +158,7 @@ def make_phase(
         actor=policy.best_actor(),
         qvalue=policy.best_qvalue(),
         planner_config=config.planner,
+        compile=config.compile,
     )
     return EvaluatePhase(agent, config, directory)
 

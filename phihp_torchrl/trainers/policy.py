@@ -15,13 +15,12 @@ from torch import Tensor
 from phihp_torchrl.agents import (
     Actor,
     FlatReplay,
+    Imagination,
     TD3Config,
     TD3Update,
     TwinQ,
     Worlds,
     draw_noise,
-    imagine,
-    imagined_return,
     make_td3_loss,
 )
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
@@ -134,7 +133,7 @@ class PolicyTrainer:
         seed: of everything random here but the networks' initial weights, which come from torch's
             global generator.
         data_states: states of real transitions ``[N, n]``, for ``start.data`` > 0.
-        compile: whether to compile the TD3 step, which takes nearly all of the time.
+        compile: whether to compile the hot loops: the TD3 step and imagination.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -164,6 +163,9 @@ class PolicyTrainer:
         self.start_states = make_start_states(task, **vars(config.start), states=data_states)
         self.loss = make_td3_loss(self.world_model, config.td3)
         self.update = TD3Update(self.loss, self.world_model, config.td3, compile=compile)
+        self.imagination = Imagination(
+            self.world_model, self.loss.max_action, self.max_age, compile=compile
+        )
         self.replay = FlatReplay(
             config.replay_capacity, task.system.state_dim, task.system.action_dim
         )
@@ -176,7 +178,12 @@ class PolicyTrainer:
             [config.evaluation_episodes], generator=self.generator
         )
         # The world's episodes have a generator of their own: the log has no part in the training.
-        self._world = TaskWorldModel(task, HybridDynamics.oracle(task))
+        self._world = Imagination(
+            TaskWorldModel(task, HybridDynamics.oracle(task)),
+            self.loss.max_action,
+            self.max_age,
+            compile=compile,
+        )
         self._world_states = task.reset.sample(
             [config.real_evaluation_episodes], generator=torch.Generator().manual_seed(seed)
         )
@@ -212,7 +219,7 @@ class PolicyTrainer:
                 if self.updates % config.td3.policy_delay == 0:
                     losses = self._learn()
                 self.updates += 1
-        imagined = self._play(self.world_model, self._evaluation_states)
+        imagined = self._play(self.imagination, self._evaluation_states)
         if imagined > self.best_return:
             self.best_return = imagined
             for kept, layer in zip(self.best, self._layers(), strict=True):
@@ -271,10 +278,10 @@ class PolicyTrainer:
         self._world_states = state["world_states"]
         self.generator.set_state(state["generator"])
 
-    def _play(self, world_model: TaskWorldModel, states: Tensor) -> float:
+    def _play(self, world: Imagination, states: Tensor) -> float:
         """Mean return of the noise-free actor; minus infinity where it left the finite numbers."""
         steps = self.config.evaluation_steps or self.task.max_steps
-        score = imagined_return(world_model, self.update.actor, states, self.loss.max_action, steps)
+        score = world.returns(self.update.networks.actor, states, steps)
         return torch.nan_to_num(score, nan=-math.inf).mean().item()
 
     def _layers(self) -> list[Tensor]:
@@ -296,13 +303,8 @@ class PolicyTrainer:
                 random_fraction=config.random_fraction if warm else 1.0,
                 generator=self.generator,
             )
-            batch, self.worlds = imagine(
-                self.world_model,
-                self.update.actor,
-                self.worlds,
-                noise,
-                self.loss.max_action,
-                self.max_age,
+            batch, self.worlds = self.imagination.chunk(
+                self.update.networks.actor, self.worlds, noise
             )
             self.replay.extend(batch)
             if warm:
