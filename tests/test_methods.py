@@ -23,6 +23,7 @@ from phihp_torchrl.trainers import (
     METHODS,
     ConfigError,
     Method,
+    RealTD3Config,
     RunConfig,
     from_mapping,
     get_method,
@@ -38,6 +39,15 @@ run_module = import_module("phihp_torchrl.trainers.run")
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 CONFIG = RECIPES / "config"
+REAL = RealTD3Config(
+    real_steps=40,
+    batch_size=8,
+    random_steps=20,
+    evaluation_interval=20,
+    evaluation_episodes=2,
+    actor_hidden_sizes=(8,),
+    critic_hidden_sizes=(8,),
+)
 TASKS = sorted(path.stem for path in (CONFIG / "task").glob("*.yaml"))
 
 
@@ -57,7 +67,9 @@ def small(method: str, task: str = SMALL.task) -> RunConfig:
     planner = SMALL.planner
     if chosen.acting == "plain_planner":
         planner = replace(planner, num_policy_candidates=0, replan_every=2)
-    return replace(SMALL, task=task, method=method, phases=None, model=model, planner=planner)
+    return replace(
+        SMALL, task=task, method=method, phases=None, model=model, td3=REAL, planner=planner
+    )
 
 
 # ------------------------------------------------------------------------------------- composing
@@ -74,7 +86,7 @@ def test_every_method_composes_on_every_task(method: str, preset: str) -> None:
         ours = config(f"method={method}", f"task={task}", f"preset={preset}")
         chosen = get_method(method)
         assert (ours.method, ours.phases) == (method, chosen.phases)
-        for section in ("model", "policy", "planner"):
+        for section in ("model", "policy", "td3", "planner"):
             assert (getattr(ours, section) is not None) == (section in chosen.sections)
         assert from_mapping(RunConfig, to_mapping(ours)) == ours
 
@@ -123,7 +135,9 @@ def test_a_run_evaluates_and_saves_what_the_method_acts_with(
     assert (agent.planner is not None) == chosen.plans
     assert (agent.actor is not None) == (chosen.acting != "plain_planner")
     steps = json.loads((path / "metadata.json").read_text())["real_steps"]
-    assert agent.metadata["samples"] == steps == (0 if method == "cem-oracle" else 60)
+    expected = {"model": small(method).model, "td3": small(method).td3}
+    assert agent.metadata["samples"] == steps
+    assert steps == sum(part.real_steps for part in expected.values() if part is not None)
     result = read_result(path)
     assert (result.label, result.samples) == (chosen.label, steps)
 

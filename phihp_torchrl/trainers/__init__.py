@@ -18,6 +18,7 @@ from phihp_torchrl.trainers.run_config import (
     read_request,
 )
 from phihp_torchrl.trainers.show import show_episode
+from phihp_torchrl.trainers.td3 import RealTD3Config, RealTD3Trainer
 
 __all__ = [
     "METHODS",
@@ -30,6 +31,8 @@ __all__ = [
     "ModelTrainer",
     "PolicyConfig",
     "PolicyTrainer",
+    "RealTD3Config",
+    "RealTD3Trainer",
     "RunConfig",
     "RunLogger",
     "RunRequest",

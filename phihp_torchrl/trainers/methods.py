@@ -49,12 +49,16 @@ class Method:
 
 
 _IMAGINED = ("model", "policy", "evaluate")
+_REAL = ("model", "td3", "evaluate")
 _PLANNED = ("model", "evaluate")
 
 METHODS = {
     "phihp": Method("PhIHP", _IMAGINED),
     "td3-im-ph": Method("TD3-im-ph", _IMAGINED, acting="actor", model_kind="hybrid"),
     "td3-im-dd": Method("TD3-im-dd", _IMAGINED, acting="actor", model_kind="data_driven"),
+    "td3": Method("TD3", ("td3", "evaluate"), acting="actor"),
+    "ph-td-mpc-star": Method("Ph-TD-MPC*", _REAL, model_kind="hybrid"),
+    "td-mpc-star": Method("TD-MPC*", _REAL, model_kind="data_driven"),
     "ph-cem": Method("Ph-CEM", _PLANNED, acting="plain_planner", model_kind="hybrid"),
     "dd-cem": Method("dd-CEM", _PLANNED, acting="plain_planner", model_kind="data_driven"),
     "cem-oracle": Method("CEM-oracle", _PLANNED, acting="plain_planner", model_kind="oracle"),

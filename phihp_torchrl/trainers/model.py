@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from phihp_torchrl.agents import Batch
 from phihp_torchrl.dynamics import (
     BLOCK,
     DynamicsLoss,
@@ -189,9 +190,18 @@ class ModelTrainer:
 
     def states(self) -> Tensor:
         """All states seen, ``[N, n]``."""
+        return self.transitions().state
+
+    def transitions(self) -> Batch:
+        """All real transitions, ``[N]``, as replay buffers take them."""
         if self.data is None:
-            return torch.zeros(0, self.task.system.state_dim)
-        return self.loss.transitions(self.data)[0]
+            system = self.task.system
+            state, action = torch.zeros(0, system.state_dim), torch.zeros(0, system.action_dim)
+            return Batch(state, action, torch.zeros(0), state, torch.zeros(0, dtype=torch.bool))
+        state, action, next_state = self.loss.transitions(self.data)
+        # The data's "done" has truncations among it, after which values go on.
+        terminated = self.task.is_terminated(next_state)
+        return Batch(state, action, self.data["next", "reward"][:, 0], next_state, terminated)
 
     def parts(self) -> dict[str, Any]:
         """The model, as an argument of :class:`~phihp_torchrl.deployment.Agent`."""

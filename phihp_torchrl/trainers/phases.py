@@ -18,6 +18,7 @@ from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
 from phihp_torchrl.trainers.show import show_episode
+from phihp_torchrl.trainers.td3 import RealTD3Trainer
 
 T = TypeVar("T")
 
@@ -192,6 +193,17 @@ def _make_policy(context: Context) -> Phase:
     )
 
 
+def _make_td3(context: Context) -> Phase:
+    config, model = context.config, context.before.get("model")
+    return RealTD3Trainer(
+        context.task,
+        _given(config.td3),
+        seed=config.seed,
+        transitions=None if model is None else model.transitions(),
+        compile=config.compile,
+    )
+
+
 def _make_evaluate(context: Context) -> Phase:
     parts: dict[str, Any] = {}
     for phase in context.before.values():
@@ -204,6 +216,7 @@ def _make_evaluate(context: Context) -> Phase:
 PHASE_KINDS = {
     "model": PhaseKind(_make_model, "steps"),
     "policy": PhaseKind(_make_policy, "updates"),
+    "td3": PhaseKind(_make_td3, "steps"),
     "evaluate": PhaseKind(_make_evaluate, "parts"),
 }
 """Phases by name; a method is a sequence of these."""

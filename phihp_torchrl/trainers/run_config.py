@@ -23,8 +23,9 @@ from phihp_torchrl.trainers.methods import Method, get_method
 from phihp_torchrl.trainers.model import ModelConfig
 from phihp_torchrl.trainers.policy import PolicyConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory
+from phihp_torchrl.trainers.td3 import RealTD3Config
 
-SECTIONS = ("model", "policy", "planner")
+SECTIONS = ("model", "policy", "td3", "planner")
 """The sections of a configuration that a method may have no use for."""
 
 FREE_KEYS = ("checkpoint_interval", "keep_checkpoints", "progress", "logger")
@@ -79,6 +80,7 @@ class RunConfig:
         progress: whether to show progress bars, on a terminal.
         model: the phase that learns a model from real steps.
         policy: the phase that learns actor and critics in imagination.
+        td3: the phase that learns actor and critics from real steps.
         planner: how the agent plans.
         evaluate: the phase that judges the agent.
         logger: where metrics go besides ``metrics.csv``.
@@ -98,6 +100,7 @@ class RunConfig:
     progress: bool = True
     model: ModelConfig | None = field(default_factory=ModelConfig)
     policy: PolicyConfig | None = field(default_factory=PolicyConfig)
+    td3: RealTD3Config | None = field(default_factory=RealTD3Config)
     planner: PlannerConfig | None = field(default_factory=PlannerConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
