@@ -106,6 +106,28 @@ def test_the_command_line_beats_the_method_and_the_method_the_task() -> None:
     assert ours.model.hidden_sizes == (16, 16, 16)  # the task's, which the method leaves alone
 
 
+def test_a_method_of_ones_own_is_one_python_file_and_one_yaml(tmp_path: Path) -> None:
+    """The example of the docs."""
+    blocks = (RECIPES.parent / "docs" / "methods" / "index.md").read_text().split("```")
+    python, yaml = (
+        next(block for block in blocks if block.startswith(kind)).split("\n", 1)[1]
+        for kind in ("python", "yaml")
+    )
+    plugin = tmp_path / "my_method.py"
+    plugin.write_text(python)
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "prior-cem.yaml").write_text(yaml)
+    overrides = ["method=prior-cem", f"plugins=[{plugin}]"]
+    with initialize_config_dir(str(CONFIG), version_base="1.3"):
+        composed = compose("phihp", [f"hydra.searchpath=[file://{tmp_path}]", *overrides])
+    try:
+        ours = read_request(composed, overrides).config
+        assert (ours.phases, ours.model.kind) == (("model", "evaluate"), "prior")
+        assert ours.policy is None
+    finally:
+        METHODS.pop("prior-cem", None)
+
+
 # ------------------------------------------------------------------------------------- running
 
 PARTS = {
