@@ -75,11 +75,18 @@ def main(composed: DictConfig) -> None:
 
 
 def load(config: Config) -> dict[str, Agent]:
-    """The agents to compare, by name: with its planner, its actor alone, or both."""
+    """The agents to compare, by name: with its planner, its actor alone, or what it has of both."""
+    both = config.planner == "both"
     agents = {}
-    if config.planner in (True, "both"):
-        agents["planner"] = load_agent(config.agent, planner=True, compile=config.compile)
-    if config.planner in (False, "both"):
+    if config.planner is not False:
+        agent = load_agent(config.agent, planner=True, compile=config.compile)
+        if agent.planner is not None:
+            agents["planner"] = agent
+        elif not both:
+            raise AgentError(f"{config.agent}: expected an agent that plans, for planner=true.")
+        if both and agent.actor is not None:
+            agents["actor"] = agent.actor_alone()
+    else:
         agents["actor"] = load_agent(config.agent, planner=False)
     return agents
 

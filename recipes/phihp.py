@@ -21,6 +21,11 @@ from phihp_torchrl.trainers import ConfigError, RunResult, read_request, read_re
 @hydra.main(version_base="1.3", config_path="config", config_name="phihp")
 def main(composed: DictConfig) -> None:
     """Run the phases, and print what the agent earned."""
+    launch(composed)
+
+
+def launch(composed: DictConfig) -> None:
+    """Run what Hydra composed, whatever its method."""
     try:
         request = read_request(composed, HydraConfig.get().overrides.task)
         result = run(request.config, request.path, resume=request.resume)
@@ -34,7 +39,7 @@ def main(composed: DictConfig) -> None:
 def report(result: RunResult) -> None:
     """Print the table of returns, or how to go on."""
     if result.signal is not None and not result.finished:
-        print(f"\nStopped. Go on with: python recipes/phihp.py resume={result.path}")
+        print(f"\nStopped. Go on with: python {sys.argv[0]} resume={result.path}")
         sys.exit(128 + result.signal)
     earned = read_result(result.path)
     if earned is not None:

@@ -48,9 +48,11 @@ class Run:
     last: dict[str, float]
 
 
-def read_run(directory: Path) -> Run:
-    """Read a run's text files."""
+def read_run(directory: Path) -> Run | None:
+    """Read a run's text files; ``None`` if it is of another method than PhIHP."""
     config = yaml.safe_load((directory / "config.yaml").read_text())
+    if config.get("method", "phihp") != "phihp":  # runs before there were methods are PhIHP's
+        return None
     metadata = json.loads((directory / "metadata.json").read_text())
     evaluation: dict[str, Any] = json.loads((directory / "evaluation.json").read_text())
     session = metadata["sessions"][0]
@@ -153,7 +155,8 @@ def origins(runs: list[Run]) -> str:
 
 def main() -> None:
     """Write the tables."""
-    runs = [read_run(path.parent) for path in sorted(RUNS.glob("*/evaluation.json"))]
+    found = [read_run(path.parent) for path in sorted(RUNS.glob("*/evaluation.json"))]
+    runs = [run for run in found if run is not None]
     labels = sorted({run.label for run in runs}, key=lambda label: (label != "default", label))
     sections = [
         "# Results\n\nMade by `python recipes/results.py` from `results/runs/`. Do not edit.\n"

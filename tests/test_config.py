@@ -64,9 +64,10 @@ def test_every_logger_composes(logger: str) -> None:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_preset_has_every_key_of_its_dataclasses(preset: str) -> None:
     given = OmegaConf.to_container(OmegaConf.load(CONFIG / "preset" / f"{preset}.yaml"))
-    whole = to_mapping(RunConfig(task="pendulum"))
-    for name in ("model", "policy", "planner"):
-        assert keys(given[name]) == keys(whole[name])
+    for method, names in (("phihp", ("model", "policy", "planner")), ("td3", ("td3",))):
+        whole = to_mapping(RunConfig(task="pendulum", method=method))
+        for name in names:
+            assert keys(given[name]) == keys(whole[name])
 
 
 def keys(mapping: Mapping[str, Any]) -> set[str]:

@@ -103,6 +103,47 @@ def test_phihp_then_resume_then_evaluate(
 
 
 @pytest.mark.slow
+def test_td3_then_resume_then_evaluate(
+    recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = (
+        "progress=false",
+        "compile=false",
+        "td3.real_steps=40",
+        "td3.random_steps=20",
+        "td3.evaluation_interval=20",
+        "td3.evaluation_episodes=2",
+        "td3.actor_hidden_sizes=[8]",
+        "td3.critic_hidden_sizes=[8]",
+        "evaluate.episodes=2",
+        "evaluate.latency_actions=3",
+        "evaluate.video=false",
+    )
+    recipe("td3", "task=cartpole", "run_dir=run", *small)
+    assert "| cartpole | 1 | 40 | – |" in capsys.readouterr().out
+    recipe("td3", "resume=run")
+    header, *rows = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
+    assert header.startswith("phase,unit,real_steps,seconds,return_mean,return_std")
+    assert [row.split(",")[2] for row in rows[:2]] == ["20", "40"]
+    recipe("evaluate", "agent=run/agent", "episodes=2", "latency_actions=3", "video=false")
+    assert "| cartpole | actor |" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="expected an agent that plans"):
+        recipe("evaluate", "agent=run/agent", "planner=true")
+
+
+@pytest.mark.slow
+def test_cem_then_evaluate(
+    recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ("progress=false", "planner.num_candidates=30", "evaluate.episodes=2")
+    small = (*small, "evaluate.latency_actions=3", "evaluate.video=false")
+    recipe("cem", "task=pendulum", "run_dir=run", *small)
+    assert "| pendulum | 1 | 0 |" in capsys.readouterr().out
+    recipe("evaluate", "agent=run/agent", "episodes=2", "latency_actions=3", "video=false")
+    assert "| pendulum | planner |" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_the_demo_trains_and_shows(
     recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,16 +17,20 @@ class TaskResult:
         samples: real samples used.
         planner: mean return of each seed's planner; empty if it was not evaluated.
         actor: mean return of each seed's actor alone.
+        label: the paper's name of the method.
     """
 
     task: str
     samples: int
     planner: tuple[float, ...] = ()
     actor: tuple[float, ...] = ()
+    label: str = "PhIHP"
 
 
 def returns_table(results: Iterable[TaskResult]) -> str:
     """A row for each result, mean ± std over seeds, beside the target and the published return.
+
+    Published returns are those of the result's own method; targets are PhIHP's.
 
     Examples:
         >>> print(returns_table([TaskResult("pendulum", 200, planner=(-190.0, -188.0))]))
@@ -47,8 +51,8 @@ def returns_table(results: Iterable[TaskResult]) -> str:
     ]
     rows = []
     for result in results:
-        paper = PUBLISHED.get(result.task, {}).get("PhIHP")
-        target = TARGETS.get(result.task)
+        paper = PUBLISHED.get(result.task, {}).get(result.label)
+        target = TARGETS.get(result.task) if result.label == "PhIHP" else None
         rows.append(
             [
                 result.task,

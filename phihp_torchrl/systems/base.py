@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -16,19 +15,21 @@ Constants = Mapping[str, Any]
 """Physical constants by name: floats, or tensors that broadcast against ``[*batch]``."""
 
 
-class System(abc.ABC):
+class System:
     """A controlled system ds/dt = F^p(s, a) + F^r(s, a) (paper, section 4.1 and appendix B).
 
     A subclass declares the names below and writes :meth:`prior`; a system with friction also writes
-    :meth:`friction`. Both are pure functions of tensors with any leading batch dimensions, so that
-    they differentiate, compile and run in any dtype. The prior is given its constants and can not
-    see those of the world; the friction is known to the world alone.
+    :meth:`friction`. One whose equations are not to be known writes :meth:`derivative` instead, and
+    only methods that need no prior can learn it. All are pure functions of tensors with any leading
+    batch dimensions, so that they differentiate, compile and run in any dtype. The prior is given
+    its constants and can not see those of the world; the friction is known to the world alone.
 
     Args:
         constants: true constants that differ from the declared ones, by name.
         friction_constants: friction coefficients that differ from the declared ones, by name.
 
     Raises:
+        TypeError: for a class that has neither a prior nor a derivative.
         ValueError: for a name that the system does not declare, or a constant that is not positive
             and finite.
     """
@@ -41,7 +42,7 @@ class System(abc.ABC):
     """State components that live on a circle, in radians."""
     velocity_of: ClassVar[Mapping[str, str]] = {}
     """The velocity that belongs to each position."""
-    default_constants: ClassVar[Mapping[str, float]]
+    default_constants: ClassVar[Mapping[str, float]] = {}
     """The constants of F^p, all positive, with the values of SPEC's worlds."""
     default_friction: ClassVar[Mapping[str, float]] = {}
     """The coefficients of F^r, not negative."""
@@ -51,6 +52,8 @@ class System(abc.ABC):
         constants: Mapping[str, float] | None = None,
         friction_constants: Mapping[str, float] | None = None,
     ) -> None:
+        if not self.has_prior and type(self).derivative is System.derivative:
+            raise TypeError(f"{type(self).__name__}: expected a method `prior` or `derivative`.")
         self.constants = _override("constants", self.default_constants, constants)
         self.friction_constants = _override(
             "friction_constants", self.default_friction, friction_constants
@@ -63,9 +66,14 @@ class System(abc.ABC):
                 f"got {self.friction_constants}."
             )
 
-    @abc.abstractmethod
+    @property
+    def has_prior(self) -> bool:
+        """Whether F^p is known."""
+        return type(self).prior is not System.prior
+
     def prior(self, state: Tensor, action: Tensor, constants: Constants) -> Tensor:
         """F^p: the frictionless equations ``[*batch, n], [*batch, m] -> [*batch, n]``."""
+        raise NotImplementedError(f"{type(self).__name__}: this system has no prior.")
 
     def friction(self, state: Tensor, action: Tensor) -> Tensor:
         """F^r of the simulated world: what the prior leaves out, ``[*batch, n]``."""

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from phihp_torchrl.agents import Batch
 from phihp_torchrl.dynamics import (
     BLOCK,
     DynamicsLoss,
@@ -38,7 +39,7 @@ class ModelConfig:
     """Phase 1.
 
     Args:
-        real_steps: real transitions in all.
+        real_steps: real transitions in all. An oracle, which has nothing to learn, may take none.
         steps_per_iteration: real transitions between two fits, T; ``None`` for a tenth of all of
             them, but no fewer than 50.
         kind: ``"hybrid"``, ``"data_driven"``, ``"prior"`` or ``"oracle"``.
@@ -73,9 +74,11 @@ class ModelConfig:
 
     def __post_init__(self) -> None:
         for name in ("real_steps", "steps_per_iteration", "refit_steps"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"{name}: expected a positive number, got {value}.")
+            value, least = getattr(self, name), 1
+            if name == "real_steps" and self.kind == "oracle":
+                least = 0
+            if value is not None and value < least:
+                raise ValueError(f"{name}: expected a number >= {least}, got {value}.")
         if self.kind not in ("hybrid", "data_driven", "prior", "oracle"):
             raise ValueError(
                 f"kind: expected 'hybrid', 'data_driven', 'prior' or 'oracle', got {self.kind!r}."
@@ -187,7 +190,22 @@ class ModelTrainer:
 
     def states(self) -> Tensor:
         """All states seen, ``[N, n]``."""
-        return self.loss.transitions(self.data)[0]
+        return self.transitions().state
+
+    def transitions(self) -> Batch:
+        """All real transitions, ``[N]``, as replay buffers take them."""
+        if self.data is None:
+            system = self.task.system
+            state, action = torch.zeros(0, system.state_dim), torch.zeros(0, system.action_dim)
+            return Batch(state, action, torch.zeros(0), state, torch.zeros(0, dtype=torch.bool))
+        state, action, next_state = self.loss.transitions(self.data)
+        # The data's "done" has truncations among it, after which values go on.
+        terminated = self.task.is_terminated(next_state)
+        return Batch(state, action, self.data["next", "reward"][:, 0], next_state, terminated)
+
+    def parts(self) -> dict[str, Any]:
+        """The model, as an argument of :class:`~phihp_torchrl.deployment.Agent`."""
+        return {"dynamics": self.dynamics}
 
     def advance(self) -> dict[str, float]:
         """Collect once and fit once; returns what to log."""

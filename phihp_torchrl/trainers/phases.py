@@ -1,25 +1,35 @@
-"""The three phases behind one interface, and how each is built on those before."""
+"""Phases behind one interface, and how each is built on those before."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from phihp_torchrl.deployment import Agent, save_agent
 from phihp_torchrl.evaluation import TaskResult, evaluate, measure_latency
-from phihp_torchrl.tasks import get_task
-from phihp_torchrl.trainers.config import to_mapping
+from phihp_torchrl.tasks import Task, get_task
+from phihp_torchrl.trainers.config import ConfigError, to_mapping
+from phihp_torchrl.trainers.methods import get_method
 from phihp_torchrl.trainers.model import ModelTrainer
 from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
 from phihp_torchrl.trainers.show import show_episode
+from phihp_torchrl.trainers.td3 import RealTD3Trainer
+
+T = TypeVar("T")
 
 
 class Phase(Protocol):
-    """What a run asks of a phase."""
+    """What a run asks of a phase.
+
+    A phase that takes real steps counts them in an attribute ``real_steps``; one that learns a part
+    of the agent returns it from a method ``parts``, as an argument of
+    :class:`~phihp_torchrl.deployment.Agent` by name.
+    """
 
     @property
     def done(self) -> bool:
@@ -52,21 +62,31 @@ class NewFile(NamedTuple):
 
 
 class EvaluatePhase:
-    """Phase 3: save the agent, let it act with its planner and by its actor alone, and show it.
+    """The last phase: let the agent act by planner and by actor, save it and show it.
+
+    An agent may have one of the two alone.
 
     Args:
         agent: the agent.
         config: the run's configuration.
         directory: where agent, pictures and ``evaluation.json`` go.
+        samples: real steps that the agent has cost.
     """
 
-    def __init__(self, agent: Agent, config: RunConfig, directory: RunDirectory) -> None:
+    def __init__(
+        self, agent: Agent, config: RunConfig, directory: RunDirectory, samples: int
+    ) -> None:
         self.agent = agent
         self.config = config
         self.directory = directory
+        self.samples = samples
         self.results: dict[str, dict[str, Any]] = {}
         self.new_files: list[NewFile] = []
-        self._steps = (("planner", self.agent), ("actor", self.agent.actor_alone()))
+        self._steps: list[tuple[str, Agent]] = []
+        if agent.planner is not None:
+            self._steps.append(("planner", agent))
+        if agent.actor is not None:
+            self._steps.append(("actor", agent.actor_alone()))
         self._finished = False
 
     @property
@@ -80,7 +100,7 @@ class EvaluatePhase:
         return self._finished
 
     def advance(self) -> dict[str, float]:
-        """Evaluate the planner, then the actor; then save and show the agent."""
+        """Evaluate the planner, then the actor, as far as there are; then save and show it."""
         self.new_files = []
         if len(self.results) < len(self._steps):
             return self._evaluate(*self._steps[len(self.results)])
@@ -112,13 +132,13 @@ class EvaluatePhase:
             "commit": origin.get("commit"),
             "dirty": origin.get("dirty"),
             "command": origin.get("command"),
-            "samples": self.config.model.real_steps,
+            "samples": self.samples,
             "config": _public(to_mapping(self.config)),
             "returns": self.results,
         }
         save_agent(self.agent, self.directory.agent, metadata=metadata)
         write_atomically(self.directory.evaluation, json.dumps(self.results, indent=2) + "\n")
-        label = f"{self.config.task}-{self.config.preset}-seed{self.config.seed}"
+        label = f"{self.config.task}-{self.config.label}"
         self.new_files.append(NewFile(label, self.directory.agent))
 
     def _show(self) -> None:
@@ -127,40 +147,119 @@ class EvaluatePhase:
             self.new_files.append(NewFile(f"evaluate/{path.stem}{path.suffix}", path))
 
 
+@dataclass(frozen=True)
+class Context:
+    """What a phase is built from.
+
+    Args:
+        config: the run's configuration.
+        task: its task.
+        before: the phases before it, done, by name.
+        directory: the run's directory.
+    """
+
+    config: RunConfig
+    task: Task
+    before: Mapping[str, Any]
+    directory: RunDirectory
+
+
+class PhaseKind(NamedTuple):
+    """A kind of phase.
+
+    Args:
+        build: makes the phase.
+        unit: what its progress counts.
+    """
+
+    build: Callable[[Context], Phase]
+    unit: str
+
+
+def _make_model(context: Context) -> Phase:
+    config = context.config
+    return ModelTrainer(context.task, _given(config.model), seed=config.seed)
+
+
+def _make_policy(context: Context) -> Phase:
+    config, model = context.config, context.before["model"]
+    return PolicyTrainer(
+        context.task,
+        model.dynamics,
+        _given(config.policy),
+        seed=config.seed,
+        data_states=model.states(),
+        compile=config.compile,
+    )
+
+
+def _make_td3(context: Context) -> Phase:
+    config, model = context.config, context.before.get("model")
+    return RealTD3Trainer(
+        context.task,
+        _given(config.td3),
+        seed=config.seed,
+        transitions=None if model is None else model.transitions(),
+        compile=config.compile,
+    )
+
+
+def _make_evaluate(context: Context) -> Phase:
+    parts: dict[str, Any] = {}
+    for phase in context.before.values():
+        parts |= phase.parts()
+    config = context.config
+    agent = Agent(context.task, **parts, planner_config=config.planner, compile=config.compile)
+    samples = real_steps(context.before)
+    return EvaluatePhase(agent, config, context.directory, samples)
+
+
+PHASE_KINDS = {
+    "model": PhaseKind(_make_model, "steps"),
+    "policy": PhaseKind(_make_policy, "updates"),
+    "td3": PhaseKind(_make_td3, "steps"),
+    "evaluate": PhaseKind(_make_evaluate, "parts"),
+}
+"""Phases by name; a method is a sequence of these."""
+
+
+def check_phases(config: RunConfig) -> None:
+    """Refuse a method with phases of an unknown kind; a plugin may have registered one.
+
+    Raises:
+        ConfigError: naming the phases.
+    """
+    phases = (*config.phases_before, *config.phases_to_do)
+    if unknown := [name for name in phases if name not in PHASE_KINDS]:
+        raise ConfigError(
+            f"method: expected phases among {sorted(PHASE_KINDS)}, {config.method!r} has {unknown}."
+        )
+
+
 def make_phase(
     name: str, config: RunConfig, before: Mapping[str, Any], directory: RunDirectory
 ) -> Phase:
     """Build a phase.
 
     Args:
-        name: ``"model"``, ``"policy"`` or ``"evaluate"``.
+        name: one of :data:`PHASE_KINDS`.
         config: the run's configuration.
-        before: the phases before it, done.
+        before: the phases before it, done, by name.
         directory: the run's directory.
     """
-    task = get_task(config.task)
-    if name == "model":
-        return ModelTrainer(task, config.model, seed=config.seed)
-    model: ModelTrainer = before["model"]
-    if name == "policy":
-        return PolicyTrainer(
-            task,
-            model.dynamics,
-            config.policy,
-            seed=config.seed,
-            data_states=model.states(),
-            compile=config.compile,
-        )
-    policy: PolicyTrainer = before["policy"]
-    agent = Agent(
-        task,
-        dynamics=model.dynamics,
-        actor=policy.best_actor(),
-        qvalue=policy.best_qvalue(),
-        planner_config=config.planner,
-        compile=config.compile,
-    )
-    return EvaluatePhase(agent, config, directory)
+    return PHASE_KINDS[name].build(Context(config, get_task(config.task), before, directory))
+
+
+def real_steps(phases: Mapping[str, Any]) -> int:
+    """Steps that these phases have taken in the real world."""
+    return sum(getattr(phase, "real_steps", 0) for phase in phases.values())
+
+
+def _given(section: T | None) -> T:
+    """A section of the configuration that RunConfig has seen to."""
+    if section is None:
+        raise ValueError("expected the section of a phase that the method has, got none.")
+    return section
 
 
 def _public(config: dict[str, Any]) -> dict[str, Any]:
@@ -176,4 +275,6 @@ def read_result(path: Path) -> TaskResult | None:
         return None
     results, config = json.loads(directory.evaluation.read_text()), directory.read_config()
     means = {name: (result["return_mean"],) for name, result in results.items()}
-    return TaskResult(config["task"], config["model"]["real_steps"], **means)
+    samples = directory.read_metadata()["real_steps"]
+    label = get_method(config.get("method", "phihp")).label
+    return TaskResult(config["task"], samples, label=label, **means)

@@ -249,6 +249,10 @@ class PolicyTrainer:
         critics = TwinQ.from_layers(self.task, self.best[len(self.update.actor) :])
         return TensorDictModule(critics, ["observation", "action"], ["state_action_value"])
 
+    def parts(self) -> dict[str, Any]:
+        """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""
+        return {"actor": self.best_actor(), "qvalue": self.best_qvalue()}
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
         return {

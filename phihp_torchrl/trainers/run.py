@@ -1,4 +1,4 @@
-"""A run: the phases of PhIHP one after the other, logged, checkpointed and resumable."""
+"""A run: the phases of a method one after the other, logged, checkpointed and resumable."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import torch
 from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from tqdm.auto import tqdm
 
-from phihp_torchrl.tasks import get_task
 from phihp_torchrl.trainers.checkpoints import (
     clear_rotation,
     load_latest,
@@ -25,14 +24,12 @@ from phihp_torchrl.trainers.checkpoints import (
 from phihp_torchrl.trainers.config import ConfigError, to_mapping
 from phihp_torchrl.trainers.interrupt import Interrupt
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
-from phihp_torchrl.trainers.phases import Phase, make_phase
-from phihp_torchrl.trainers.run_config import PHASES, RunConfig
+from phihp_torchrl.trainers.phases import PHASE_KINDS, Phase, check_phases, make_phase, real_steps
+from phihp_torchrl.trainers.run_config import RunConfig, check_task
 from phihp_torchrl.trainers.run_directory import MetricsTable, RunDirectory, describe_origin
 from phihp_torchrl.trainers.start import check_same, start_directory
 
 _log = logging.getLogger(__name__)
-
-_BAR_UNITS = {"model": " steps", "policy": " updates", "evaluate": " parts"}
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,8 @@ def run(config: RunConfig, path: str | Path | None = None, *, resume: bool = Fal
     torch.set_num_threads(config.threads)
     # Adam's moments of unused weights become denormal, and those are slow.
     torch.set_flush_denormal(True)
-    get_task(config.task)
+    check_task(config)
+    check_phases(config)
     if resume:
         if path is None:
             raise ConfigError("resume: expected the directory of a run.")
@@ -108,7 +106,7 @@ class _Run:
         metadata = self.directory.read_metadata()
         table, logger, finished = None, RunLogger(), True
         try:
-            for name in PHASES[: PHASES.index(self.config.phases[-1]) + 1]:
+            for name in (*self.config.phases_before, *self.config.phases_to_do):
                 _seed_everything(self.config.seed)
                 phase = make_phase(name, self.config, self.phases, self.directory)
                 self.phases[name] = phase
@@ -134,7 +132,7 @@ class _Run:
         done, total = phase.progress
         hidden = None if self.config.progress else True  # None: shown on a terminal alone
         with tqdm(
-            desc=name, initial=done, total=total, unit=_BAR_UNITS[name], disable=hidden
+            desc=name, initial=done, total=total, unit=f" {PHASE_KINDS[name].unit}", disable=hidden
         ) as bar:
             while not phase.done:
                 if self.interrupt:
@@ -143,7 +141,7 @@ class _Run:
                 start = time.monotonic()
                 metrics = phase.advance()
                 position.seconds[name] = position.seconds.get(name, 0.0) + time.monotonic() - start
-                position.real_steps = getattr(phase, "real_steps", position.real_steps)
+                position.real_steps = real_steps(self.phases)
                 self._log_unit(name, metrics, table, logger)
                 position.unit += 1
                 bar.total = phase.progress[1]

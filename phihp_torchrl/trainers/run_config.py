@@ -19,17 +19,20 @@ from phihp_torchrl.planners.factory import PlannerConfig
 from phihp_torchrl.tasks import get_task
 from phihp_torchrl.trainers.config import ConfigError, from_mapping
 from phihp_torchrl.trainers.loggers import LoggerConfig
+from phihp_torchrl.trainers.methods import Method, get_method
 from phihp_torchrl.trainers.model import ModelConfig
 from phihp_torchrl.trainers.policy import PolicyConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory
+from phihp_torchrl.trainers.td3 import RealTD3Config
 
-PHASES = ("model", "policy", "evaluate")
-"""The phases in their order: learn the model, learn the policy in it, act with both."""
+SECTIONS = ("model", "policy", "td3", "planner")
+"""The sections of a configuration that a method may have no use for."""
 
 FREE_KEYS = ("checkpoint_interval", "keep_checkpoints", "progress", "logger")
 """What a resumed run may change, for it changes no result."""
 
-_GROUPS = ("task", "preset", "logger")
+_NAMES = ("task", "preset", "method")
+_GROUPS = (*_NAMES, "logger")
 _PLACES = ("run_dir", "resume")
 
 
@@ -58,13 +61,16 @@ class EvaluateConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """All that decides what a run does; ``recipes/config/phihp.yaml`` mirrors it.
+    """All that decides what a run does; ``recipes/config/base.yaml`` mirrors it.
+
+    Sections that the method has no use for become ``None``.
 
     Args:
         task: name of a registered task.
+        method: name of the method (:data:`~phihp_torchrl.trainers.methods.METHODS`).
         preset: name of the set of hyper-parameters, for the record.
         seed: of everything random.
-        phases: consecutive ones of :data:`PHASES`.
+        phases: those to do, consecutive ones of the method's; ``None`` becomes all of them.
         start_from: directory of a run that has done the phases before (``from`` in YAML).
         plugins: Python files or modules to import, which register tasks.
         checkpoint_interval: seconds between two checkpoints; 0 for one after every unit of work.
@@ -72,17 +78,19 @@ class RunConfig:
         threads: intra-op threads.
         compile: whether to compile the hot loops.
         progress: whether to show progress bars, on a terminal.
-        model: phase 1.
-        policy: phase 2.
-        planner: how the agent plans, in phase 3.
-        evaluate: phase 3.
+        model: the phase that learns a model from real steps.
+        policy: the phase that learns actor and critics in imagination.
+        td3: the phase that learns actor and critics from real steps.
+        planner: how the agent plans.
+        evaluate: the phase that judges the agent.
         logger: where metrics go besides ``metrics.csv``.
     """
 
     task: str
+    method: str = "phihp"
     preset: str = "default"
     seed: int = 0
-    phases: tuple[str, ...] = PHASES
+    phases: tuple[str, ...] | None = None
     start_from: str | None = field(default=None, metadata={"key": "from"})
     plugins: tuple[str, ...] = ()
     checkpoint_interval: float = 60.0
@@ -90,9 +98,10 @@ class RunConfig:
     threads: int = 1
     compile: bool = False
     progress: bool = True
-    model: ModelConfig = field(default_factory=ModelConfig)
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    model: ModelConfig | None = field(default_factory=ModelConfig)
+    policy: PolicyConfig | None = field(default_factory=PolicyConfig)
+    td3: RealTD3Config | None = field(default_factory=RealTD3Config)
+    planner: PlannerConfig | None = field(default_factory=PlannerConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)
 
@@ -105,19 +114,59 @@ class RunConfig:
             raise ValueError(
                 f"checkpoint_interval: expected seconds >= 0, got {self.checkpoint_interval}."
             )
-        self._check_phases()
+        method = get_method(self.method)
+        self._check_sections(method)
+        if self.phases is None:
+            object.__setattr__(self, "phases", method.phases)
+        self._check_phases(method.phases)
 
-    def _check_phases(self) -> None:
-        first = PHASES.index(self.phases[0]) if self.phases and self.phases[0] in PHASES else 0
-        consecutive = PHASES[first : first + len(self.phases)]
-        if not self.phases or tuple(self.phases) != consecutive:
+    @property
+    def label(self) -> str:
+        """What tells this run from others of its task."""
+        method = "" if self.method == "phihp" else f"{self.method}-"
+        return f"{method}{self.preset}-seed{self.seed}"
+
+    @property
+    def phases_before(self) -> tuple[str, ...]:
+        """The method's phases that another run has done."""
+        phases = get_method(self.method).phases
+        return phases[: phases.index(self.phases_to_do[0])]
+
+    @property
+    def phases_to_do(self) -> tuple[str, ...]:
+        """The phases that are this run's own."""
+        return self.phases or get_method(self.method).phases
+
+    def _check_sections(self, method: Method) -> None:
+        for name in SECTIONS:
+            if name not in method.sections:
+                object.__setattr__(self, name, None)
+            elif getattr(self, name) is None:
+                raise ValueError(f"{name}: expected settings for method {self.method!r}, got none.")
+        kind = self.model and self.model.kind
+        if method.model_kind not in (None, kind):
             raise ValueError(
-                f"phases: expected consecutive ones of {list(PHASES)}, got {list(self.phases)}."
+                f"model.kind: expected {method.model_kind!r} for method {self.method!r}, "
+                f"got {kind!r}."
+            )
+        if method.acting == "plain_planner" and self.planner.num_policy_candidates:  # type: ignore[union-attr]
+            raise ValueError(
+                f"planner.num_policy_candidates: expected 0 for method {self.method!r}, which "
+                f"learns no actor, got {self.planner.num_policy_candidates}."  # type: ignore[union-attr]
+            )
+
+    def _check_phases(self, known: tuple[str, ...]) -> None:
+        ours = self.phases or ()
+        first = known.index(ours[0]) if ours and ours[0] in known else 0
+        if not ours or tuple(ours) != known[first : first + len(ours)]:
+            raise ValueError(
+                f"phases: expected consecutive ones of {list(known)}, those of method "
+                f"{self.method!r}, got {list(ours)}."
             )
         if first > 0 and self.start_from is None:
             raise ValueError(
-                f"from: expected the directory of a run that has done phase {PHASES[first - 1]!r}, "
-                f"for phases={list(self.phases)}."
+                f"from: expected the directory of a run that has done phase {known[first - 1]!r}, "
+                f"for phases={list(ours)}."
             )
         if first == 0 and self.start_from is not None:
             raise ValueError("from: expected none, for phases begin with the first one.")
@@ -141,8 +190,9 @@ class RunRequest:
 def read_request(composed: DictConfig, overrides: Sequence[str]) -> RunRequest:
     """Turn what Hydra composed into a typed request, and import its plugins.
 
-    A task's YAML has a section for each preset. It goes over the preset, and the command line over
-    both; so the command line is applied once more.
+    A task's YAML has a section for each preset, and a method's one of what it changes. The task's
+    goes over the preset, the method's over the task's, and the command line over all of them; so
+    the command line is applied once more. Sections that the method has no use for are left out.
 
     Args:
         composed: the composed configuration.
@@ -159,11 +209,12 @@ def read_request(composed: DictConfig, overrides: Sequence[str]) -> RunRequest:
     for key, value in places.items():
         if value is not None and not isinstance(value, str):
             raise ConfigError(f"{key}: expected a directory, got {value!r}.")
-    presets = config.pop("presets", None) or {}
+    presets, changes = config.pop("presets", None) or {}, config.pop("changes", None) or {}
     if places["resume"] is None:
-        section = presets.get(config.get("preset")) or {}
-        _check_section(section, config)
-        config = OmegaConf.merge(config, section)
+        preset = presets.get(config.get("preset")) or {}
+        for name, section in (("presets.<preset>", preset), ("changes", changes)):
+            _check_section(section, config, name)
+            config = OmegaConf.merge(config, section)
     else:
         if places["run_dir"] is not None:
             raise ConfigError("run_dir: expected none with resume, which names the directory.")
@@ -171,14 +222,15 @@ def read_request(composed: DictConfig, overrides: Sequence[str]) -> RunRequest:
         if any(_key(line) == "logger" for line in lines):
             config.logger = given.logger
     for line in lines:
-        if _key(line) in _GROUPS[:2]:
+        if _key(line) in _NAMES:
             config[_key(line)] = str(line.value())
         elif _key(line) not in (*_GROUPS, *_PLACES):
             OmegaConf.update(config, _key(line), line.value(), force_add=True)
     plain: Any = OmegaConf.to_container(config, resolve=True)
     import_plugins(plain.get("plugins") or ())
+    _leave_out(plain, [_key(line) for line in lines])
     typed = from_mapping(RunConfig, plain)
-    _check_task(typed.task)
+    check_task(typed)
     path = places["resume"] or places["run_dir"]
     return RunRequest(typed, path, resume=places["resume"] is not None)
 
@@ -221,20 +273,48 @@ def _key(line: Override) -> str:
     return str(line.key_or_group)
 
 
-def _check_task(name: str) -> None:
+def check_task(config: RunConfig) -> None:
+    """Refuse a task that is not registered, and one without prior where the method needs it.
+
+    Raises:
+        ConfigError: naming the key.
+    """
     try:
-        get_task(name)
+        task = get_task(config.task)
     except ValueError as error:
         raise ConfigError(f"{error} A plugin may register more: plugins=[my_task.py].") from error
+    kind = None if config.model is None else config.model.kind
+    if kind in ("hybrid", "prior") and not task.system.has_prior:
+        raise ConfigError(
+            f"model.kind: method {config.method!r} with a model of kind {kind!r} needs a prior, "
+            f"and the system of task {task.name!r}, {type(task.system).__name__}, has none; "
+            "expected 'data_driven' or a method that needs none."
+        )
 
 
-def _check_section(section: Mapping[str, Any], config: Mapping[str, Any], path: str = "") -> None:
-    """A task's section may only set what the preset has."""
-    for key, value in section.items():
-        name = f"{path}.{key}" if path else str(key)
-        if key not in config:
+def _leave_out(plain: dict[str, Any], given: Sequence[str]) -> None:
+    """Take the sections out that the method has no use for, unless the command line sets them."""
+    name = plain.get("method", "phihp")
+    try:
+        used = get_method(name).sections
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    for section in SECTIONS:
+        if section in used:
+            continue
+        plain.pop(section, None)
+        if keys := [key for key in given if key.split(".")[0] == section]:
             raise ConfigError(
-                f"presets.<preset>.{name}: unknown key; expected one of {sorted(config)}."
+                f"{keys[0]}: method {name!r} has no use for {section!r}; "
+                f"its sections are {list(used)}."
             )
+
+
+def _check_section(section: Mapping[str, Any], config: Mapping[str, Any], path: str) -> None:
+    """A task's or a method's section may only set what the preset has."""
+    for key, value in section.items():
+        name = f"{path}.{key}"
+        if key not in config:
+            raise ConfigError(f"{name}: unknown key; expected one of {sorted(config)}.")
         if isinstance(value, Mapping) and isinstance(config[key], Mapping):
             _check_section(value, config[key], name)

@@ -89,11 +89,11 @@ class RunDirectory:
         write_atomically(self.metadata, json.dumps(metadata, indent=2) + "\n")
 
 
-def new_run_directory(task: str, preset: str, seed: int) -> Path:
-    """Make ``outputs/<task>/<time>-<preset>-seed<seed>``, numbered where that is taken."""
+def new_run_directory(task: str, label: str) -> Path:
+    """Make ``outputs/<task>/<time>-<label>``, numbered where that is taken."""
     parent = Path("outputs") / task
     parent.mkdir(parents=True, exist_ok=True)
-    name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{preset}-seed{seed}"
+    name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{label}"
     for number in range(1, 1000):
         path = parent / (name if number == 1 else f"{name}-{number}")
         try:
