@@ -253,7 +253,7 @@ def test_compiled_by_inductor_equals_eager(name):
             torch.testing.assert_close(compiled.chunk(actor, worlds, noise), expected)
             worlds = expected[1]
             # 12 steps: two compiled chunks and a rest.
-            returns = (x.returns(actor, worlds.state, 12) for x in (compiled, eager))
+            returns = (x.returns(actor, worlds.state, 12).total for x in (compiled, eager))
             torch.testing.assert_close(*returns, rtol=1e-4, atol=1e-4)
             actor[0].mul_(0.9)
 
@@ -264,7 +264,7 @@ def test_what_cannot_compile_says_so(caplog):
     imagination = Imagination(model, torch.tensor([2.0]), 3, compile=True)
     assert "not compiled" in caplog.text
     actor = [p.detach() for p in Actor(task, (4,)).mlp.parameters()]
-    assert imagination.returns(actor, task.reset.sample([2]), 6).shape == (2,)
+    assert imagination.returns(actor, task.reset.sample([2]), 6).total.shape == (2,)
 
 
 # Returns
@@ -274,7 +274,7 @@ def test_what_cannot_compile_says_so(caplog):
 def test_returns_in_chunks_are_the_whole(steps):
     model, actor, high = make("cartpole")
     state = model.task.coverage.sample([20])
-    values = Imagination(model, high, 9).returns(actor, state, steps)
+    values = Imagination(model, high, 9).returns(actor, state, steps).total
     assert torch.equal(values, imagined_return(model, actor, state, high, steps))
 
 

@@ -19,6 +19,7 @@ from phihp_torchrl.agents.networks import (
     make_qvalue,
     make_twin_qvalue,
 )
+from phihp_torchrl.agents.refit import CriticRefit, Refit, RefitConfig
 from phihp_torchrl.agents.replay import FlatReplay
 from phihp_torchrl.agents.td3 import TD3Config, TD3Update, make_td3_loss
 
@@ -26,9 +27,12 @@ __all__ = [
     "Actor",
     "Batch",
     "ChunkNoise",
+    "CriticRefit",
     "FlatReplay",
     "Imagination",
     "QNetwork",
+    "Refit",
+    "RefitConfig",
     "TD3Config",
     "TD3Update",
     "TwinQ",

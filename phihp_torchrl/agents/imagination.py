@@ -112,9 +112,9 @@ class Returns(NamedTuple):
     state: Tensor
     """Where they are, ``[N, n]``."""
     total: Tensor
-    """Undiscounted rewards so far, ``[N]``."""
-    alive: Tensor
-    """1 where the episode goes on, else 0, ``[N]``."""
+    """Discounted rewards so far, ``[N]``."""
+    weight: Tensor
+    """What the next reward counts: gamma^k after k steps, 0 after a termination; ``[N]``."""
 
     @classmethod
     def from_state(cls, state: Tensor) -> Returns:
@@ -123,16 +123,21 @@ class Returns(NamedTuple):
 
 
 def sum_rewards(
-    world_model: TaskWorldModel, actor: Layers, returns: Returns, action_high: Tensor, steps: int
+    world_model: TaskWorldModel,
+    actor: Layers,
+    returns: Returns,
+    action_high: Tensor,
+    steps: int,
+    gamma: float = 1.0,
 ) -> Returns:
     """Go on for ``steps`` steps of the noise-free policy."""
-    state, total, alive = returns
+    state, total, weight = returns
     for _ in range(steps):
         action = policy(actor, world_model.observe(state), action_high)
         state, reward, terminated = world_model.transition(state, action)
-        total = total + alive * reward
-        alive = alive * (1.0 - terminated.to(alive.dtype))
-    return Returns(state, total, alive)
+        total = total + weight * reward
+        weight = gamma * weight * (1.0 - terminated.to(weight.dtype))
+    return Returns(state, total, weight)
 
 
 def imagined_return(
@@ -160,7 +165,7 @@ class Imagination:
         ...     TaskWorldModel(task, HybridDynamics.oracle(task)), torch.tensor([2.0]), max_age=200
         ... )
         >>> layers = [layer.detach() for layer in Actor(task).mlp.parameters()]
-        >>> imagination.returns(layers, task.reset.sample([3]), steps=200).shape
+        >>> imagination.returns(layers, task.reset.sample([3]), steps=200).total.shape
         torch.Size([3])
     """
 
@@ -188,9 +193,9 @@ class Imagination:
         """Step all worlds through a chunk: :func:`imagine`."""
         return self._imagine(actor, worlds, noise, self.action_high, self.max_age)
 
-    def returns(self, actor: Layers, state: Tensor, steps: int) -> Tensor:
-        """Undiscounted return of the noise-free policy from each state ``[N, n]``, ``[N]``."""
+    def returns(self, actor: Layers, state: Tensor, steps: int, gamma: float = 1.0) -> Returns:
+        """Returns of ``steps`` steps of the noise-free policy from each state ``[N, n]``."""
         returns, size = Returns.from_state(state), self._RETURN_STEPS
         for _ in range(steps // size):
-            returns = self._sum_rewards_chunk(actor, returns, self.action_high, size)
-        return self._sum_rewards(actor, returns, self.action_high, steps % size).total
+            returns = self._sum_rewards_chunk(actor, returns, self.action_high, size, gamma)
+        return self._sum_rewards(actor, returns, self.action_high, steps % size, gamma)

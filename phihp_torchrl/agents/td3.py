@@ -13,6 +13,7 @@ from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
 from phihp_torchrl.agents.functional import (
     Batch,
+    Layers,
     actor_loss,
     adam_,
     adam_rates,
@@ -174,6 +175,19 @@ class TD3Update(nn.Module):
                 ),
             )
         return self._networks
+
+    @torch.no_grad()
+    def restart(self, actor: Layers, critics: Layers) -> None:
+        """Go on from these layers, targets included; the moments of Adam stay as they are."""
+        nets = self.networks
+        for mine, given in (
+            (nets.actor, actor),
+            (nets.target_actor, actor),
+            (nets.critics, critics),
+            (nets.target_critics, critics),
+        ):
+            for layer, value in zip(mine, given, strict=True):
+                layer.copy_(value)
 
     def _apply(self, *args: Any, **kwargs: Any) -> TD3Update:
         self._networks = None  # they may move

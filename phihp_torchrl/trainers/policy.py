@@ -14,8 +14,10 @@ from torch import Tensor
 
 from phihp_torchrl.agents import (
     Actor,
+    CriticRefit,
     FlatReplay,
     Imagination,
+    RefitConfig,
     TD3Config,
     TD3Update,
     TwinQ,
@@ -62,6 +64,7 @@ class PolicyConfig:
         max_seconds: stop early after this time; ``None`` for never.
         start: where imagined lives start.
         td3: TD3's own hyper-parameters.
+        refit: when and how the critics are fitted to the best actor's returns in the model.
     """
 
     updates: int = 8000
@@ -82,6 +85,7 @@ class PolicyConfig:
     max_seconds: float | None = None
     start: StartConfig = field(default_factory=StartConfig)
     td3: TD3Config = field(default_factory=TD3Config)
+    refit: RefitConfig = field(default_factory=RefitConfig)
 
     def __post_init__(self) -> None:
         positive = (
@@ -117,6 +121,13 @@ class PolicyConfig:
                     f"{name}: expected a multiple of td3.policy_delay = {self.td3.policy_delay}, "
                     f"got {value}."
                 )
+        for name in ("start", "interval"):
+            value = getattr(self.refit, name)
+            if value % self.evaluation_interval:
+                raise ValueError(
+                    f"refit.{name}: expected a multiple of evaluation_interval = "
+                    f"{self.evaluation_interval}, got {value}."
+                )
 
 
 class PolicyTrainer:
@@ -126,6 +137,10 @@ class PolicyTrainer:
     resets in the model, and the best actor met is kept together with its critics. The real world
     is played in for the log alone: neither it nor an evaluation seed has a say in that choice.
 
+    Where ``config.refit`` says so, the critics of the best actor so far are fitted to what it earns
+    in the model, and training goes on from there: policy iteration, with TD3 as the improvement.
+    The last fit makes the critics that the planner relies on.
+
     Args:
         task: the task.
         dynamics: the model to imagine with; it is not changed.
@@ -133,7 +148,7 @@ class PolicyTrainer:
         seed: of everything random here but the networks' initial weights, which come from torch's
             global generator.
         data_states: states of real transitions ``[N, n]``, for ``start.data`` > 0.
-        compile: whether to compile the hot loops: the TD3 step and imagination.
+        compile: whether to compile the hot loops: the TD3 step, imagination, and fitting critics.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -165,6 +180,9 @@ class PolicyTrainer:
         self.update = TD3Update(self.loss, self.world_model, config.td3, compile=compile)
         self.imagination = Imagination(
             self.world_model, self.loss.max_action, self.max_age, compile=compile
+        )
+        self.refit = CriticRefit(
+            self.world_model, self.imagination, config.refit, config.td3.gamma, compile=compile
         )
         self.replay = FlatReplay(
             config.replay_capacity, task.system.state_dim, task.system.action_dim
@@ -220,10 +238,10 @@ class PolicyTrainer:
                     losses = self._learn()
                 self.updates += 1
         imagined = self._play(self.imagination, self._evaluation_states)
-        if imagined > self.best_return:
+        # Of equal ones the later, which has learned more; none that left the finite numbers.
+        if -math.inf < imagined >= self.best_return:
             self.best_return = imagined
-            for kept, layer in zip(self.best, self._layers(), strict=True):
-                kept.copy_(layer)
+            self._keep(self._layers())
         metrics = {
             "policy/updates": float(self.updates),
             "policy/imagined_steps": float(self.replay.written),
@@ -231,6 +249,8 @@ class PolicyTrainer:
             "policy/best_imagined_return": self.best_return,
             **{f"policy/{name}": value.item() for name, value in losses.items()},
         }
+        if config.refit.is_due(self.updates, config.updates):
+            metrics |= self._refit_critics()
         if config.real_evaluation_episodes:
             metrics["policy/real_return"] = self._play(self._world, self._world_states)
         self.seconds += time.perf_counter() - start
@@ -285,8 +305,26 @@ class PolicyTrainer:
     def _play(self, world: Imagination, states: Tensor) -> float:
         """Mean return of the noise-free actor; minus infinity where it left the finite numbers."""
         steps = self.config.evaluation_steps or self.task.max_steps
-        score = world.returns(self.update.networks.actor, states, steps)
+        score = world.returns(self.update.networks.actor, states, steps).total
         return torch.nan_to_num(score, nan=-math.inf).mean().item()
+
+    def _keep(self, layers: list[Tensor]) -> None:
+        for kept, layer in zip(self.best, layers, strict=True):
+            kept.copy_(layer)
+
+    def _refit_critics(self) -> dict[str, float]:
+        """Fit the best actor's critics to its returns, and go on from these."""
+        count = len(self.update.networks.actor)
+        actor, critics = self.best[:count], self.best[count:]
+        batch = self.replay.sample(self.config.refit.transitions, self.generator)
+        refit = self.refit(actor, critics, batch.state, batch.action, self.generator)
+        self._keep([*actor, *refit.critics])
+        self.update.restart(actor, refit.critics)
+        return {
+            "policy/critic_lag": refit.lag,
+            "policy/critic_error_before": refit.error_before,
+            "policy/critic_error": refit.error_after,
+        }
 
     def _layers(self) -> list[Tensor]:
         return [*self.update.actor, *self.update.critics]
