@@ -13,6 +13,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from test_real_td3 import SMALL as REAL
 from test_run import CONFIG as SMALL
 from test_run import Crash, assert_equal, rows
 
@@ -23,7 +24,6 @@ from phihp_torchrl.trainers import (
     METHODS,
     ConfigError,
     Method,
-    RealTD3Config,
     RunConfig,
     from_mapping,
     get_method,
@@ -39,15 +39,6 @@ run_module = import_module("phihp_torchrl.trainers.run")
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 CONFIG = RECIPES / "config"
-REAL = RealTD3Config(
-    real_steps=40,
-    batch_size=8,
-    random_steps=20,
-    evaluation_interval=20,
-    evaluation_episodes=2,
-    actor_hidden_sizes=(8,),
-    critic_hidden_sizes=(8,),
-)
 TASKS = sorted(path.stem for path in (CONFIG / "task").glob("*.yaml"))
 
 

@@ -15,13 +15,20 @@ from phihp_torchrl.agents.networks import (
     Actor,
     QNetwork,
     TwinQ,
+    copy_actor,
+    copy_twin_qvalue,
     make_actor,
     make_qvalue,
     make_twin_qvalue,
 )
 from phihp_torchrl.agents.refit import CriticRefit, Refit, RefitConfig
 from phihp_torchrl.agents.replay import FlatReplay
-from phihp_torchrl.agents.td3 import TD3Config, TD3Update, make_td3_loss
+from phihp_torchrl.agents.td3 import (
+    TD3Config,
+    TD3Update,
+    learning_rate_scale,
+    make_td3_loss,
+)
 
 __all__ = [
     "Actor",
@@ -37,9 +44,12 @@ __all__ = [
     "TD3Update",
     "TwinQ",
     "Worlds",
+    "copy_actor",
+    "copy_twin_qvalue",
     "draw_noise",
     "imagine",
     "imagined_return",
+    "learning_rate_scale",
     "make_actor",
     "make_qvalue",
     "make_td3_loss",

@@ -152,3 +152,14 @@ def make_twin_qvalue(task: Task, hidden_sizes: Sequence[int] = (200, 200, 200)) 
     return TensorDictModule(
         TwinQ(task, hidden_sizes), ["observation", "action"], ["state_action_value"]
     )
+
+
+def copy_actor(task: Task, layers: Layers) -> TensorDictModule:
+    """An actor with copies of the layers that TD3 trains, ``"observation"`` -> ``"action"``."""
+    return TensorDictModule(Actor.from_layers(task, layers), ["observation"], ["action"])
+
+
+def copy_twin_qvalue(task: Task, layers: Layers) -> TensorDictModule:
+    """Both critics with copies of the layers that TD3 trains, as planners take them."""
+    critics = TwinQ.from_layers(task, layers)
+    return TensorDictModule(critics, ["observation", "action"], ["state_action_value"])

@@ -96,6 +96,20 @@ def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
     return loss
 
 
+def learning_rate_scale(left: float, decay: float) -> float:
+    """A factor that stays 1, and falls with the end of a training to a twentieth.
+
+    Args:
+        left: share of the training that is left.
+        decay: over which share of it, at the end, the factor falls; 0 for never.
+
+    Examples:
+        >>> [learning_rate_scale(left, decay=0.5) for left in (0.9, 0.25, 0.0)]
+        [1.0, 0.5, 0.05]
+    """
+    return 1.0 if decay == 0 else max(0.05, min(1.0, left / decay))
+
+
 class TD3Update(nn.Module):
     """``policy_delay`` critic updates, one actor update and the soft updates, as one graph.
 

@@ -13,16 +13,17 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from phihp_torchrl.agents import (
-    Actor,
     CriticRefit,
     FlatReplay,
     Imagination,
     RefitConfig,
     TD3Config,
     TD3Update,
-    TwinQ,
     Worlds,
+    copy_actor,
+    copy_twin_qvalue,
     draw_noise,
+    learning_rate_scale,
     make_td3_loss,
 )
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
@@ -258,16 +259,15 @@ class PolicyTrainer:
 
     def actor(self) -> TensorDictModule:
         """The actor as it is now."""
-        return _as_actor(Actor.from_layers(self.task, self.update.actor))
+        return copy_actor(self.task, self.update.actor)
 
     def best_actor(self) -> TensorDictModule:
         """The actor with the best imagined return so far."""
-        return _as_actor(Actor.from_layers(self.task, self.best[: len(self.update.actor)]))
+        return copy_actor(self.task, self.best[: len(self.update.actor)])
 
     def best_qvalue(self) -> TensorDictModule:
         """The twin critics that were the best actor's."""
-        critics = TwinQ.from_layers(self.task, self.best[len(self.update.actor) :])
-        return TensorDictModule(critics, ["observation", "action"], ["state_action_value"])
+        return copy_twin_qvalue(self.task, self.best[len(self.update.actor) :])
 
     def parts(self) -> dict[str, Any]:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""
@@ -355,10 +355,6 @@ class PolicyTrainer:
     def _learn(self) -> dict[str, Tensor]:
         config = self.config
         left = 1.0 - self.updates / config.updates
-        scale = 1.0 if config.decay == 0 else max(0.05, min(1.0, left / config.decay))
+        scale = learning_rate_scale(left, config.decay)
         batch = self.replay.sample(config.batch_size * config.td3.policy_delay, self.generator)
         return self.update(batch, scale, self.generator)
-
-
-def _as_actor(actor: Actor) -> TensorDictModule:
-    return TensorDictModule(actor, ["observation"], ["action"])

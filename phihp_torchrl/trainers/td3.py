@@ -8,20 +8,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from phihp_torchrl.agents import (
-    Actor,
     Batch,
     FlatReplay,
     TD3Config,
     TD3Update,
-    TwinQ,
     Worlds,
+    copy_actor,
+    copy_twin_qvalue,
     draw_noise,
     imagine,
     imagined_return,
+    learning_rate_scale,
     make_td3_loss,
 )
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
@@ -203,11 +203,9 @@ class RealTD3Trainer:
 
     def parts(self) -> dict[str, Any]:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""
-        actor = Actor.from_layers(self.task, self.update.actor)
-        critics = TwinQ.from_layers(self.task, self.update.critics)
         return {
-            "actor": TensorDictModule(actor, ["observation"], ["action"]),
-            "qvalue": TensorDictModule(critics, ["observation", "action"], ["state_action_value"]),
+            "actor": copy_actor(self.task, self.update.actor),
+            "qvalue": copy_twin_qvalue(self.task, self.update.critics),
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -254,7 +252,7 @@ class RealTD3Trainer:
         """One round of updates."""
         config = self.config
         left = 1.0 - self.real_steps / config.real_steps
-        scale = 1.0 if config.decay == 0 else max(0.05, min(1.0, left / config.decay))
+        scale = learning_rate_scale(left, config.decay)
         batch = self.replay.sample(config.batch_size * config.policy_delay, self.generator)
         self.updates += config.policy_delay
         return self.update(batch, scale, self.generator)
