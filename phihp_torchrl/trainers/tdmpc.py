@@ -164,6 +164,10 @@ class TDMPCTrainer:
         """The agent as it is now, on these very networks."""
         return TDMPCAgent(self.task, self.told, self.config.planner.at(self.real_steps))
 
+    def parts(self) -> dict[str, Any]:
+        """The whole agent, whose planner is its own."""
+        return {"agent": self.agent()}
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
         return {

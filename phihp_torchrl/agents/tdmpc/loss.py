@@ -21,6 +21,7 @@ from phihp_torchrl.agents.tdmpc.losses import (
     td_target,
 )
 from phihp_torchrl.agents.tdmpc.told import TOLD
+from phihp_torchrl.compilation import compile_graph
 
 _NOISE_CLIP = 0.3
 """Where the published runs clip the noise on the policy's actions, in units of the bounds."""
@@ -129,7 +130,7 @@ class TDMPCLoss(LossModule):
         self.told = told
         self.target = copy.deepcopy(told).requires_grad_(False)
         self.config = config
-        self._core = torch.compile(self._losses, fullgraph=True) if compile else self._losses
+        self._core = compile_graph(self._losses, enabled=compile)
 
     @property
     def in_keys(self) -> Sequence[NestedKey]:
