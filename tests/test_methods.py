@@ -16,7 +16,9 @@ from omegaconf import OmegaConf
 from test_run import CONFIG as SMALL
 from test_run import Crash, assert_equal, rows
 
+from phihp_torchrl.agents.tdmpc import TDMPCConfig, TOLDConfig
 from phihp_torchrl.deployment import load_agent
+from phihp_torchrl.planners.factory import MPPIConfig
 from phihp_torchrl.systems import Pendulum, System
 from phihp_torchrl.tasks import get_task, list_tasks, register_task, registry
 from phihp_torchrl.trainers import (
@@ -25,6 +27,7 @@ from phihp_torchrl.trainers import (
     Method,
     RealTD3Config,
     RunConfig,
+    TDMPCTrainConfig,
     from_mapping,
     get_method,
     read_request,
@@ -48,6 +51,25 @@ REAL = RealTD3Config(
     actor_hidden_sizes=(8,),
     critic_hidden_sizes=(8,),
 )
+TDMPC = TDMPCTrainConfig(
+    real_steps=50,
+    seed_steps=25,
+    updates_per_step=0.2,
+    horizon=3,
+    batch_size=4,
+    replay_capacity=60,
+    evaluation_interval=30,
+    evaluation_episodes=2,
+    learn=TDMPCConfig(told=TOLDConfig(latent_dim=4, encoder_dim=8, mlp_dim=8)),
+    planner=MPPIConfig(
+        planning_horizon=2,
+        optim_steps=1,
+        num_candidates=8,
+        top_k=2,
+        num_policy_candidates=2,
+        schedule_steps=40,
+    ),
+)
 TASKS = sorted(path.stem for path in (CONFIG / "task").glob("*.yaml"))
 
 
@@ -68,7 +90,14 @@ def small(method: str, task: str = SMALL.task) -> RunConfig:
     if chosen.acting == "plain_planner":
         planner = replace(planner, num_policy_candidates=0, replan_every=2)
     return replace(
-        SMALL, task=task, method=method, phases=None, model=model, td3=REAL, planner=planner
+        SMALL,
+        task=task,
+        method=method,
+        phases=None,
+        model=model,
+        td3=REAL,
+        tdmpc=TDMPC,
+        planner=planner,
     )
 
 
@@ -86,7 +115,7 @@ def test_every_method_composes_on_every_task(method: str, preset: str) -> None:
         ours = config(f"method={method}", f"task={task}", f"preset={preset}")
         chosen = get_method(method)
         assert (ours.method, ours.phases) == (method, chosen.phases)
-        for section in ("model", "policy", "td3", "planner"):
+        for section in ("model", "policy", "td3", "tdmpc", "planner"):
             assert (getattr(ours, section) is not None) == (section in chosen.sections)
         assert from_mapping(RunConfig, to_mapping(ours)) == ours
 
@@ -134,6 +163,7 @@ PARTS = {
     "hybrid_planner": {"planner", "actor"},
     "plain_planner": {"planner"},
     "actor": {"actor"},
+    "own_planner": {"planner", "actor"},
 }
 
 
@@ -154,12 +184,12 @@ def test_a_run_evaluates_and_saves_what_the_method_acts_with(
     results = json.loads((path / "evaluation.json").read_text())
     assert results.keys() == PARTS[chosen.acting]
     agent = load_agent(path / "agent")
-    assert (agent.planner is not None) == chosen.plans
+    assert (agent.planner is not None) == ("planner" in PARTS[chosen.acting])
     assert (agent.actor is not None) == (chosen.acting != "plain_planner")
     steps = json.loads((path / "metadata.json").read_text())["real_steps"]
-    expected = {"model": small(method).model, "td3": small(method).td3}
+    expected = [small(method).model, small(method).td3, small(method).tdmpc]
     assert agent.metadata["samples"] == steps
-    assert steps == sum(part.real_steps for part in expected.values() if part is not None)
+    assert steps == sum(part.real_steps for part in expected if part is not None)
     result = read_result(path)
     assert (result.label, result.samples) == (chosen.label, steps)
 
