@@ -96,6 +96,15 @@ def test_twin_critics_differ_and_actions_are_in_physical_units():
     torch.testing.assert_close(half.q_values(latent, action / 2), values)
 
 
+def test_gradients_pass_the_clipping_of_noise():
+    """At 0.76 of the bounds noise of 0.9 is clipped; the gradient is that of tanh all the same."""
+    output = torch.tensor([[1.0]], requires_grad=True)
+    action = make_told().squash(output, torch.tensor([[0.9]]))
+    action.sum().backward()
+    assert action.item() == pytest.approx(2.0)
+    assert output.grad.item() == pytest.approx(2.0 / torch.cosh(torch.tensor(1.0)).item() ** 2)
+
+
 @pytest.mark.parametrize("name", ["latent_dim", "encoder_dim", "mlp_dim"])
 def test_bad_sizes_are_named(name):
     with pytest.raises(ValueError, match=f"^{name}: expected"):
@@ -114,8 +123,14 @@ class LinearTOLD:
     def encode(self, observation):
         return observation + self.shift
 
+    def actor(self, latent):
+        return 0.5 * latent
+
+    def squash(self, output, noise=None):
+        return output + (0.0 if noise is None else noise)
+
     def policy(self, latent, noise=None):
-        return 0.5 * latent + (0.0 if noise is None else noise)
+        return self.squash(self.actor(latent), noise)
 
     def predict(self, latent, action):
         return latent + action, (2 * latent).squeeze(-1)
@@ -172,12 +187,14 @@ def test_policy_loss_by_hand():
     latents = torch.tensor([[[1.0], [2.0], [4.0]]])
     noise = torch.zeros(1, 3, 1)
 
-    def loss(*args):
-        return policy_loss(LinearTOLD(), latents, hand_slices(*args), noise, rho=0.5).item()
+    def loss(*args, **kwargs):
+        return policy_loss(LinearTOLD(), latents, hand_slices(*args), noise, 0.5, **kwargs).item()
 
     assert loss() == -(1.5 + 0.5 * 3 + 0.25 * 6)
     assert loss((False, True)) == -(1.5 + 0.5 * 3)  # the last latent is beyond the end
     assert loss((True, False), (True, False)) == -1.5
+    penalty = 0.5**2 + 0.5 * 1**2 + 0.25 * 2**2
+    assert loss(output_penalty=0.5) == loss() + 0.5 * penalty
 
 
 def test_termination_loss_is_the_cross_entropy_along_the_slice():

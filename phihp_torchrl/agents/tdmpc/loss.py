@@ -40,6 +40,8 @@ class TDMPCLossConfig:
         termination_coef: weight of the termination's, where episodes can terminate.
         policy_noise: std of the noise on the policy's actions in the losses, in units of their
             bounds.
+        output_penalty: weight of the squared outputs of the policy's network before tanh, in the
+            policy's loss; 0 as published.
     """
 
     gamma: float = 0.99
@@ -49,13 +51,14 @@ class TDMPCLossConfig:
     value_coef: float = 0.1
     termination_coef: float = 0.5
     policy_noise: float = 0.05
+    output_penalty: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("gamma", "rho"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a number in (0, 1], got {getattr(self, name)}.")
         coefficients = [f"{name}_coef" for name in ("consistency", "reward", "value")]
-        for name in (*coefficients, "termination_coef", "policy_noise"):
+        for name in (*coefficients, "termination_coef", "policy_noise", "output_penalty"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
 
@@ -202,7 +205,7 @@ class TDMPCLoss(LossModule):
             + c.termination_coef * losses.termination
         )
         horizon = slices.valid.shape[1]
-        policy = policy_loss(self.told, latents, slices, noise[1], c.rho)
+        policy = policy_loss(self.told, latents, slices, noise[1], c.rho, c.output_penalty)
         return (weight * total).mean() / horizon, policy, losses
 
     @torch.no_grad()

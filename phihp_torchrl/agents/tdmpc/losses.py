@@ -126,11 +126,19 @@ def model_losses(
     return total, torch.stack(latents, 1)
 
 
-def policy_loss(told: TOLD, latents: Tensor, slices: Slices, noise: Tensor, rho: float) -> Tensor:
+def policy_loss(
+    told: TOLD,
+    latents: Tensor,
+    slices: Slices,
+    noise: Tensor,
+    rho: float,
+    output_penalty: float = 0.0,
+) -> Tensor:
     r"""How little the critics think of the policy, a scalar.
 
     .. math::
-        -\sum_{t=0}^{H} \rho^t \min_j Q_j(\bar z_t, \pi(\bar z_t))
+        -\sum_{t=0}^{H} \rho^t \Big(\min_j Q_j(\bar z_t, \pi(\bar z_t))
+        - c\, \lVert \tanh^{-1} \pi(\bar z_t) \rVert^2\Big)
 
     averaged over the slices. Gradients reach the policy alone: the latents are detached and the
     critics held. A latent after a termination does not count.
@@ -141,11 +149,15 @@ def policy_loss(told: TOLD, latents: Tensor, slices: Slices, noise: Tensor, rho:
         slices: transitions.
         noise: on the policy's action, in units of its bounds, ``[N, H + 1, m]``.
         rho: temporal weight.
+        output_penalty: weight :math:`c` of the outputs before tanh. Where tanh is flat the critics'
+            gradients do not reach the policy any more; this brings it back. Not in the publication.
     """
     latents = latents.detach()
     # The latent that a transition leads to counts if the episode goes on from there.
     goes_on = slices.valid & ~slices.terminated
     counts = torch.cat([torch.ones_like(goes_on[:, :1]), goes_on], 1)
-    value = told.q_values(latents, told.policy(latents, noise), held=True).amin(0)
+    output = told.actor(latents)
+    value = told.q_values(latents, told.squash(output, noise), held=True).amin(0)
+    value = value - output_penalty * output.square().sum(-1)
     weights = temporal_weights(counts, rho)
     return -(weights * value).sum(1).mean()

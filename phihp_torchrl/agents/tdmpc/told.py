@@ -134,9 +134,16 @@ class TOLD(nn.Module):
             latent: ``[*batch, l]``.
             noise: added to the action, in units of its bounds, ``[*batch, m]``.
         """
-        action = self.actor(latent).tanh()
+        return self.squash(self.actor(latent), noise)
+
+    def squash(self, output: Tensor, noise: Tensor | None = None) -> Tensor:
+        """The action that an output of the actor's network ``[*batch, m]`` stands for.
+
+        Gradients pass the clipping of noisy actions as if it were not there, as published.
+        """
+        action = output.tanh()
         if noise is not None:
-            action = (action + noise).clamp(-1.0, 1.0)
+            action = action + ((action + noise).clamp(-1.0, 1.0) - action).detach()
         return action * self.action_high
 
     def termination_logit(self, latent: Tensor) -> Tensor | None:
