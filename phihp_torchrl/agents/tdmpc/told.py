@@ -143,7 +143,8 @@ class TOLD(nn.Module):
         """
         action = output.tanh()
         if noise is not None:
-            action = action + ((action + noise).clamp(-1.0, 1.0) - action).detach()
+            clipped = (action + noise).clamp(-1.0, 1.0)
+            action = clipped.detach() + (action - action.detach())
         return action * self.action_high
 
     def termination_logit(self, latent: Tensor) -> Tensor | None:
