@@ -98,7 +98,7 @@ def test_evaluation_has_no_part_in_the_training():
     evaluated.update.loss.target.load_state_dict(plain.update.loss.target.state_dict())
     finish(plain)
     metrics = finish(evaluated)
-    assert sum("tdmpc/planner_return" in m for m in metrics) == 3
+    assert sum("return_mean" in m for m in metrics) == 3
     for ours, theirs in zip(plain.told.parameters(), evaluated.told.parameters(), strict=True):
         assert torch.equal(ours, theirs)
 
@@ -196,7 +196,7 @@ def test_an_agent_forgets_where_an_episode_starts():
     ("key", "value", "message"),
     [
         ("mlp_dim", 10**9, "told: expected at most"),
-        ("mlp_dim", 16, r"expected torch.float32 of shape \[16"),
+        ("mlp_dim", 16, "expected torch.float32 of shape"),
         ("mlp_dim", 0, "mlp_dim: expected a positive number"),
         ("latent_dim", "4", "told"),
     ],

@@ -244,13 +244,16 @@ class TDMPCTrainer:
     def _evaluate(self) -> dict[str, float]:
         """The planner without noise, and the policy alone, in the simulated real world."""
         self.evaluated = self.real_steps
-        agent, metrics = self.agent(), {}
-        for name, actor in (("planner", agent), ("policy", agent.actor_alone())):
-            played = evaluate(
-                actor, self.task, episodes=self.config.evaluation_episodes, seed=self.seed
-            )
-            metrics[f"tdmpc/{name}_return"] = played.mean
-        return metrics
+        agent, episodes = self.agent(), self.config.evaluation_episodes
+        played, alone = (
+            evaluate(actor, self.task, episodes=episodes, seed=self.seed)
+            for actor in (agent, agent.actor_alone())
+        )
+        return {
+            "return_mean": played.mean,
+            "return_std": played.std,
+            "tdmpc/policy_return": alone.mean,
+        }
 
 
 def _as_floats(rollout: TensorDictBase) -> TensorDict:
