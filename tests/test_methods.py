@@ -17,7 +17,9 @@ from test_real_td3 import SMALL as REAL
 from test_run import CONFIG as SMALL
 from test_run import Crash, assert_equal, rows
 
+from phihp_torchrl.agents.tdmpc import TDMPCConfig, TOLDConfig
 from phihp_torchrl.deployment import load_agent
+from phihp_torchrl.planners.factory import MPPIConfig
 from phihp_torchrl.systems import Pendulum, System
 from phihp_torchrl.tasks import get_task, list_tasks, register_task, registry
 from phihp_torchrl.trainers import (
@@ -25,6 +27,7 @@ from phihp_torchrl.trainers import (
     ConfigError,
     Method,
     RunConfig,
+    TDMPCTrainConfig,
     from_mapping,
     get_method,
     read_request,
@@ -39,6 +42,25 @@ run_module = import_module("phihp_torchrl.trainers.run")
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 CONFIG = RECIPES / "config"
+TDMPC = TDMPCTrainConfig(
+    real_steps=50,
+    seed_steps=25,
+    updates_per_step=0.2,
+    horizon=3,
+    batch_size=4,
+    replay_capacity=60,
+    evaluation_interval=30,
+    evaluation_episodes=2,
+    learn=TDMPCConfig(told=TOLDConfig(latent_dim=4, encoder_dim=8, mlp_dim=8)),
+    planner=MPPIConfig(
+        planning_horizon=2,
+        optim_steps=1,
+        num_candidates=8,
+        top_k=2,
+        num_policy_candidates=2,
+        schedule_steps=40,
+    ),
+)
 TASKS = sorted(path.stem for path in (CONFIG / "task").glob("*.yaml"))
 
 
@@ -59,7 +81,14 @@ def small(method: str, task: str = SMALL.task) -> RunConfig:
     if chosen.acting == "plain_planner":
         planner = replace(planner, num_policy_candidates=0, replan_every=2)
     return replace(
-        SMALL, task=task, method=method, phases=None, model=model, td3=REAL, planner=planner
+        SMALL,
+        task=task,
+        method=method,
+        phases=None,
+        model=model,
+        td3=REAL,
+        tdmpc=TDMPC,
+        planner=planner,
     )
 
 
@@ -77,7 +106,7 @@ def test_every_method_composes_on_every_task(method: str, preset: str) -> None:
         ours = config(f"method={method}", f"task={task}", f"preset={preset}")
         chosen = get_method(method)
         assert (ours.method, ours.phases) == (method, chosen.phases)
-        for section in ("model", "policy", "td3", "planner"):
+        for section in ("model", "policy", "td3", "tdmpc", "planner"):
             assert (getattr(ours, section) is not None) == (section in chosen.sections)
         assert from_mapping(RunConfig, to_mapping(ours)) == ours
 
@@ -125,6 +154,7 @@ PARTS = {
     "hybrid_planner": {"planner", "actor"},
     "plain_planner": {"planner"},
     "actor": {"actor"},
+    "own_planner": {"planner", "actor"},
 }
 
 
@@ -145,12 +175,12 @@ def test_a_run_evaluates_and_saves_what_the_method_acts_with(
     results = json.loads((path / "evaluation.json").read_text())
     assert results.keys() == PARTS[chosen.acting]
     agent = load_agent(path / "agent")
-    assert (agent.planner is not None) == chosen.plans
+    assert (agent.planner is not None) == ("planner" in PARTS[chosen.acting])
     assert (agent.actor is not None) == (chosen.acting != "plain_planner")
     steps = json.loads((path / "metadata.json").read_text())["real_steps"]
-    expected = {"model": small(method).model, "td3": small(method).td3}
+    expected = [small(method).model, small(method).td3, small(method).tdmpc]
     assert agent.metadata["samples"] == steps
-    assert steps == sum(part.real_steps for part in expected.values() if part is not None)
+    assert steps == sum(part.real_steps for part in expected if part is not None)
     result = read_result(path)
     assert (result.label, result.samples) == (chosen.label, steps)
 

@@ -28,8 +28,8 @@ from phihp_torchrl.planners import (
     CEMPlanner,
     PlanSettings,
     Problem,
-    core,
     plan,
+    pool,
     score_sequences,
 )
 
@@ -169,7 +169,7 @@ def spy_on_scores(monkeypatch):
         seen.append((actions, scores))
         return scores, actions
 
-    monkeypatch.setattr(core, "score_sequences", spy)
+    monkeypatch.setattr(pool, "score_sequences", spy)
     return seen
 
 
@@ -732,7 +732,7 @@ def scripted(planner, monkeypatch):
         means.append(mean)
         sequence = 10.0 * number + torch.arange(horizon)
         shape = (*tensordict.batch_size, horizon, 1)
-        return core.Plan(sequence.unsqueeze(-1).expand(shape), torch.zeros(tensordict.batch_size))
+        return pool.Plan(sequence.unsqueeze(-1).expand(shape), torch.zeros(tensordict.batch_size))
 
     monkeypatch.setattr(planner, "plan", plan_of)
     return means

@@ -5,5 +5,6 @@ from __future__ import annotations
 from phihp_torchrl.deployment.agent import Agent
 from phihp_torchrl.deployment.files import load_agent, save_agent
 from phihp_torchrl.deployment.reading import AgentError
+from phihp_torchrl.deployment.tdmpc import TDMPCAgent
 
-__all__ = ["Agent", "AgentError", "load_agent", "save_agent"]
+__all__ = ["Agent", "AgentError", "TDMPCAgent", "load_agent", "save_agent"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -71,7 +71,7 @@ class ResidualBlueprint:
     activation: str
 
     def __post_init__(self) -> None:
-        _check_sizes("residual.hidden_sizes", self.hidden_sizes)
+        check_sizes("residual.hidden_sizes", self.hidden_sizes)
         if self.activation not in _ACTIVATIONS:
             raise ValueError(
                 f"residual.activation: expected one of {sorted(_ACTIVATIONS)}, "
@@ -172,7 +172,7 @@ class Blueprint:
     def __post_init__(self) -> None:
         for name in ("actor_hidden_sizes", "critic_hidden_sizes"):
             if getattr(self, name) is not None:
-                _check_sizes(name, getattr(self, name))
+                check_sizes(name, getattr(self, name))
 
     @classmethod
     def of(cls, agent: Agent) -> Blueprint:
@@ -197,9 +197,9 @@ class Blueprint:
             planner=agent.planner_config,
         )
 
-    def build(self, task: Task, **options: Any) -> Agent:
-        """A new agent, untrained; ``options`` go to :class:`~phihp_torchrl.deployment.Agent`."""
-        return Agent(task, **self.build_modules(task), planner_config=self.planner, **options)
+    def assemble(self, task: Task, parts: Mapping[str, Any], **options: Any) -> Agent:
+        """The agent of these parts; ``options`` go to :class:`~phihp_torchrl.deployment.Agent`."""
+        return Agent(task, **parts, planner_config=self.planner, **options)
 
     def build_modules(self, task: Task) -> dict[str, Any]:
         """New modules by name, untrained."""
@@ -240,7 +240,8 @@ def _integrator_name(integrator: Integrator) -> str:
     )
 
 
-def _check_sizes(name: str, sizes: Sequence[Any]) -> None:
+def check_sizes(name: str, sizes: Sequence[Any]) -> None:
+    """Refuse widths that no network of ours has, before memory is taken for it."""
     fits = len(sizes) <= _MAX_LAYERS and all(
         isinstance(size, int) and not isinstance(size, bool) and 1 <= size <= _MAX_WIDTH
         for size in sizes

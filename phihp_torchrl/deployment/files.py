@@ -16,7 +16,8 @@ from safetensors.torch import save as dump_tensors
 from torch import Tensor, nn
 
 from phihp_torchrl.deployment.agent import Agent
-from phihp_torchrl.deployment.blueprint import Blueprint, TaskSignature, modules
+from phihp_torchrl.deployment.blueprint import TaskSignature
+from phihp_torchrl.deployment.kinds import AnyBlueprint, describe, modules
 from phihp_torchrl.deployment.reading import (
     MAX_JSON_BYTES,
     AgentError,
@@ -54,7 +55,7 @@ def save_agent(
             finite, or metadata that is not JSON.
     """
     try:
-        blueprint = Blueprint.of(agent)
+        blueprint = describe(agent)
         blueprint.build_modules(agent.task)  # what can not be built again should not be saved
     except (ValueError, TypeError) as error:
         raise AgentError(f"agent: it can not be saved: {error}") from error
@@ -144,10 +145,9 @@ def load_agent(
             own = {k.removeprefix(start): t for k, t in weights.items() if k.startswith(start)}
             part.load_state_dict(own)
             part.to(device).requires_grad_(False).eval()
-        return Agent(
+        return blueprint.assemble(
             task,
-            **parts,
-            planner_config=blueprint.planner,
+            parts,
             use_planner=planner,
             compile=compile,
             metadata=content["metadata"],
@@ -195,7 +195,7 @@ def _resolve_task(path: Path, saved: TaskSignature, wanted: str | Task | None) -
 
 
 def _read_weights(
-    path: Path, blueprint: Blueprint, task: Task, content: dict[str, Any]
+    path: Path, blueprint: AnyBlueprint, task: Task, content: dict[str, Any]
 ) -> dict[str, Tensor]:
     agent_path = path.with_name(AGENT_FILE)
     try:

@@ -13,13 +13,17 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from torch import Tensor
 
+from phihp_torchrl.agents.tdmpc.told import TOLDConfig
 from phihp_torchrl.deployment.blueprint import (
     Blueprint,
     DynamicsBlueprint,
     ResidualBlueprint,
     TaskSignature,
 )
+from phihp_torchrl.deployment.kinds import AnyBlueprint, is_tdmpc
+from phihp_torchrl.deployment.tdmpc import TDMPCBlueprint
 from phihp_torchrl.planners.factory import PlannerConfig
+from phihp_torchrl.planners.settings import MPPISettings
 
 MAX_JSON_BYTES = 1_000_000
 _MAX_WEIGHT_BYTES = 1_000_000_000
@@ -60,11 +64,17 @@ def _read_bytes(path: Path, limit: int) -> bytes:
     return data
 
 
-def read_blueprint(path: Path, content: dict[str, Any]) -> Blueprint:
+def read_blueprint(path: Path, content: dict[str, Any]) -> AnyBlueprint:
     """The blueprint in an agent's JSON, checked."""
+    kind = TDMPCBlueprint if is_tdmpc(content) else Blueprint
     try:
-        own = {field.name: content[field.name] for field in fields(Blueprint)}
+        own = {field.name: content[field.name] for field in fields(kind)}
         own["task"] = _from_json(TaskSignature, "task", own["task"])
+        if kind is TDMPCBlueprint:
+            own["told"] = _from_json(TOLDConfig, "told", own["told"])
+            if own["planner"] is not None:
+                own["planner"] = _from_json(MPPISettings, "planner", own["planner"])
+            return _from_json(kind, "agent", own)
         if (dynamics := own["dynamics"]) is not None:
             if isinstance(dynamics, dict) and dynamics.get("residual") is not None:
                 residual = _from_json(ResidualBlueprint, "dynamics.residual", dynamics["residual"])

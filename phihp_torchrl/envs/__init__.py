@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from phihp_torchrl.envs.batched import make_task_env
+from phihp_torchrl.envs.latent import LatentEnv
 from phihp_torchrl.envs.registration import register_envs
 from phihp_torchrl.envs.start_states import (
     BoxStates,
@@ -17,6 +18,7 @@ from phihp_torchrl.envs.worlds import TaskEnv
 __all__ = [
     "BoxStates",
     "DataStates",
+    "LatentEnv",
     "MixtureStates",
     "StartStates",
     "TaskEnv",

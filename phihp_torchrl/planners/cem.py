@@ -2,38 +2,23 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Collection, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import MPCPlannerBase
+from torchrl.envs import EnvBase
 
-from phihp_torchrl.compilation import compile_graph
-from phihp_torchrl.planners.core import Plan, plan
-from phihp_torchrl.planners.env_model import (
-    EnvModel,
-    find_action,
-    find_done,
-    find_limits,
-    find_reward,
-    find_situation,
-)
-from phihp_torchrl.planners.functions import actor_function, value_function
+from phihp_torchrl.planners.base import SamplingPlanner
+from phihp_torchrl.planners.core import plan
 from phihp_torchrl.planners.memory import PlanMemory
-from phihp_torchrl.planners.scoring import ActionBounds, Problem, TensorModel
+from phihp_torchrl.planners.pool import Plan
 from phihp_torchrl.planners.settings import PlanSettings
 
-_logger = logging.getLogger(__name__)
 
-
-class CEMPlanner(MPCPlannerBase):
+class CEMPlanner(SamplingPlanner):
     """Plan with the cross-entropy method and a policy as a prior (PhIHP, section 4.3).
 
     At each call it proposes action sequences, some by the actor rolled out in the model and the
@@ -95,7 +80,7 @@ class CEMPlanner(MPCPlannerBase):
         backend: ``"tensor"``, ``"env"``, or ``"auto"`` for the first where it can be.
         compile: whether to compile the plan as one full graph; a dict is passed to
             :func:`torch.compile`. Needs the tensor backend and a model whose integrator compiles,
-            and is left out otherwise. Each batch size is a graph of its own.
+            and is left out otherwise.
         generator: source of the noise, on the environment's device. Defaults to torch's global one.
 
     Raises:
@@ -115,6 +100,8 @@ class CEMPlanner(MPCPlannerBase):
         >>> planner(TensorDict(observation=observation, batch_size=[2]))["action"].shape
         torch.Size([2, 1])
     """
+
+    settings: PlanSettings
 
     def __init__(
         self,
@@ -166,158 +153,23 @@ class CEMPlanner(MPCPlannerBase):
             compare_with_actor=compare_with_actor,
             actor_margin=actor_margin,
         )
-        action_key, reward_key = unravel_key(action_key), unravel_key(reward_key)
-        action_spec = find_action(env, action_key)
-        super().__init__(env, action_key=action_key)
-        self.action_spec = action_spec
-        self.settings = settings
-        self.action_key, self.reward_key = action_key, find_reward(env, reward_key)
-        self.value_key, self.is_init_key = unravel_key(value_key), unravel_key(is_init_key)
-        self.done_keys = find_done(env, done_keys)
-        situation = find_situation(env)
-        self.observation_key = _choose(situation, observation_key)
-        self.actor, self.qvalue = actor, qvalue
-        self.generator = generator
-        self._check_modules(situation)
-        low, high = find_limits(action_spec)
-        self.register_buffer("_action_low", low, persistent=False)
-        self.register_buffer("_action_high", high, persistent=False)
-        self.memory = self._make_memory(replan_every, warm_start)
-        self._choose_backend(backend, done_keys is None, bool(compile))
-        # A tensor model finds the state from one observation, on either path.
-        self.in_keys = list(situation)
-        if self._has_tensor_model() and self.observation_key is not None:
-            self.in_keys = list(dict.fromkeys([self.observation_key, *self._module_keys()]))
-        self._expected = {key: situation[key] for key in self.in_keys}
-        self._compile = compile
-        # One for each batch size, and one with and one without a mean: compiled, each is a graph.
-        self._planning_functions: dict[tuple[torch.Size, bool], Callable[..., Plan]] = {}
-
-    # Construction: what fits together.
-
-    def _has_tensor_model(self) -> bool:
-        # A transformed environment lends its base's attributes, and its transforms would be lost.
-        return (
-            not isinstance(self.env, TransformedEnv)
-            and getattr(self.env, "tensor_model", None) is not None
+        super().__init__(
+            env,
+            settings,
+            plan,
+            _make_memory(settings, replan_every, warm_start),
+            reward_key,
+            action_key,
+            actor=actor,
+            qvalue=qvalue,
+            observation_key=observation_key,
+            done_keys=done_keys,
+            value_key=value_key,
+            is_init_key=is_init_key,
+            backend=backend,
+            compile=compile,
+            generator=generator,
         )
-
-    def _module_keys(self) -> list[NestedKey]:
-        """What actor and critics read besides the action."""
-        modules = [module for module in (self.actor, self.qvalue) if module is not None]
-        keys = [unravel_key(key) for module in modules for key in module.in_keys]
-        return [key for key in keys if key != self.action_key]
-
-    def _why_not_tensors(self, default_done_keys: bool) -> str | None:
-        """Why the environment must be stepped, if so."""
-        if not self._has_tensor_model():
-            return f"{type(self.env).__name__} has no tensor_model of its own"
-        if self.observation_key is None:
-            return "it has several observations and observation_key does not say which to take"
-        if self.reward_key != ("next", "reward") or not default_done_keys:
-            return "reward_key or done_keys are not those of its tensor_model"
-        if others := set(self._module_keys()) - {self.observation_key}:
-            return f"actor or qvalue read {sorted(others, key=str)}, not {self.observation_key!r}"
-        return None
-
-    def _choose_backend(self, backend: str, default_done_keys: bool, compile: bool) -> None:
-        if backend not in ("auto", "tensor", "env"):
-            raise ValueError(f"backend: expected 'auto', 'tensor' or 'env', got {backend!r}.")
-        reason = self._why_not_tensors(default_done_keys)
-        if backend == "tensor" and reason:
-            raise ValueError(f"backend: expected 'env' or 'auto', got 'tensor', but {reason}.")
-        if self.env.batch_size and not self._has_tensor_model():
-            raise ValueError(f"env: expected batch size [], got {list(self.env.batch_size)}.")
-        self.uses_tensors = backend != "env" and not reason
-        if not self.uses_tensors:
-            _logger.log(
-                logging.WARNING if compile else logging.INFO,
-                "CEMPlanner steps the environment%s: %s.",
-                ", which is not compiled" if compile else "",
-                reason or "backend='env'",
-            )
-        elif compile and not getattr(self.env.tensor_model, "compiles", True):
-            _logger.warning("CEMPlanner is not compiled: the model's integrator does not compile.")
-            compile = False
-        self._compiles = compile and self.uses_tensors
-
-    def _make_memory(self, replan_every: int, warm_start: bool) -> PlanMemory | None:
-        s = self.settings
-        if isinstance(replan_every, bool) or not isinstance(replan_every, int):
-            raise ValueError(f"replan_every: expected an integer, got {replan_every!r}.")
-        if not 1 <= replan_every <= s.planning_horizon:
-            raise ValueError(
-                f"replan_every: expected 1 to planning_horizon={s.planning_horizon}, "
-                f"got {replan_every}."
-            )
-        if warm_start and s.num_policy_candidates == s.num_candidates:
-            raise ValueError(
-                "warm_start: expected random candidates to start from the previous plan, got "
-                f"num_policy_candidates=num_candidates={s.num_candidates}."
-            )
-        needed = replan_every > 1 or warm_start
-        return PlanMemory(replan_every, warm_start) if needed else None
-
-    def _check_modules(self, situation: Collection[NestedKey]) -> None:
-        actor, qvalue = self.actor, self.qvalue
-        if actor is None and self.settings.num_policy_candidates:
-            raise ValueError(
-                "actor: expected a module to propose num_policy_candidates="
-                f"{self.settings.num_policy_candidates} sequences, got None."
-            )
-        if actor is None and qvalue is not None:
-            raise ValueError(
-                "actor: expected a module to act beyond the horizon, for qvalue, got None."
-            )
-        for name, module, key in (
-            ("actor", actor, self.action_key),
-            ("qvalue", qvalue, self.value_key),
-        ):
-            if module is None:
-                continue
-            if key not in (keys := getattr(module, "out_keys", [])):
-                raise ValueError(
-                    f"{name}: expected a TensorDict module that writes {key!r}, "
-                    f"got {type(module).__name__} that writes {list(keys)}."
-                )
-            allowed = [*situation, *([self.action_key] if module is qvalue else [])]
-            if unknown := [k for k in module.in_keys if unravel_key(k) not in allowed]:
-                raise ValueError(f"{name}: expected in_keys among {allowed}, got {unknown}.")
-
-    def _build(self) -> Callable[..., Plan]:
-        """The plan as a function of observation, noise and mean."""
-        action_shape = self.action_spec.shape
-        if self.uses_tensors:
-            model: TensorModel = self.env.tensor_model
-        else:
-            model = EnvModel(
-                self.env, self.action_key, action_shape, self.reward_key, self.done_keys
-            )
-        actor = value = None
-        if self.actor is not None:
-            actor = actor_function(self.actor, self.action_key, action_shape.numel())
-        if self.qvalue is not None:
-            value = value_function(self.qvalue, self.value_key, self.action_key, action_shape)
-        bounds = ActionBounds.from_limits(self._action_low, self._action_high)
-        problem = Problem(model=model, bounds=bounds, actor=actor, value=value)
-        function = partial(plan, problem=problem, settings=self.settings)
-        options = dict(self._compile) if isinstance(self._compile, dict) else {}
-        return compile_graph(function, enabled=self._compiles, **options)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # The functions hold on to these very modules, so a copy builds its own.
-        return {**super().__getstate__(), "_planning_functions": {}}
-
-    def _apply(self, *args: Any, **kwargs: Any) -> CEMPlanner:
-        self._planning_functions = {}  # they hold the bounds as they were
-        return super()._apply(*args, **kwargs)
-
-    # Planning.
-
-    def reset(self) -> None:
-        """Forget the previous plan: a new episode starts."""
-        if self.memory is not None:
-            self.memory.clear()
 
     @torch.no_grad()
     def planning(self, tensordict: TensorDictBase, noise: Tensor | None = None) -> Tensor:
@@ -334,15 +186,11 @@ class CEMPlanner(MPCPlannerBase):
         if self.memory is None:
             actions = self.plan(tensordict, noise).actions
             return actions[..., 0, :].reshape(*batch, *self.action_spec.shape)
-        is_init = tensordict.get(self.is_init_key, None)
-        if is_init is not None:
-            is_init = is_init.reshape(batch)
-        center = ActionBounds.from_limits(self._action_low, self._action_high).center
         action = self.memory.act(
             lambda mean: self.plan(tensordict, noise, mean).actions,
             batch,
-            is_init,
-            center.expand(self.settings.planning_horizon, -1),
+            self._starts(tensordict),
+            self.bounds.center.expand(self.settings.planning_horizon, -1),
         )
         return action.reshape(*batch, *self.action_spec.shape)
 
@@ -366,45 +214,26 @@ class CEMPlanner(MPCPlannerBase):
         """
         self._check_observation(tensordict)
         batch = tensordict.batch_size
-        low = self._action_low
-        shape = self.settings.noise_shape(tuple(batch), low.numel())
+        shape = self.settings.noise_shape(tuple(batch), self._action_low.numel())
         if noise is None:
-            noise = torch.randn(shape, generator=self.generator, dtype=low.dtype, device=low.device)
+            noise = self._draw(*shape)
         elif noise.shape != shape:
             raise ValueError(f"noise: expected shape {list(shape)}, got {list(noise.shape)}.")
-        shapes = (batch, mean is None)
-        if shapes not in self._planning_functions:
-            self._planning_functions[shapes] = self._build()
-        if self.uses_tensors:
-            observation = tensordict.get(self.observation_key)
-        else:
-            observation = tensordict.select(*self.in_keys)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return self._planning_functions[shapes](observation, noise, mean)
-
-    def _check_observation(self, tensordict: TensorDictBase) -> None:
-        batch, device = tensordict.batch_size, self._action_low.device
-        for key, spec in self._expected.items():
-            value = tensordict.get(key, None)
-            shape = torch.Size([*batch, *spec.shape])
-            if value is None:
-                raise ValueError(f"{key}: expected a tensor of shape {list(shape)}, got none.")
-            if value.shape != shape or value.dtype != spec.dtype or value.device != device:
-                raise ValueError(
-                    f"{key}: expected {spec.dtype} of shape {list(shape)} on {device}, "
-                    f"got {value.dtype} of shape {list(value.shape)} on {value.device}."
-                )
-            # Elsewhere this would wait for the device; the plan falls back to the actor's action.
-            if device.type == "cpu" and not value.isfinite().all():
-                raise ValueError(f"{key}: expected finite observations, got some that are not.")
+        return self._call_plan(tensordict, noise, mean)
 
 
-def _choose(situation: Collection[NestedKey], key: NestedKey | None) -> NestedKey | None:
-    """The observation that a tensor model is given, if it is clear which."""
-    if key is not None:
-        if unravel_key(key) not in situation:
-            raise ValueError(f"observation_key: expected one of {list(situation)}, got {key!r}.")
-        return unravel_key(key)
-    if "observation" in situation:
-        return "observation"
-    return next(iter(situation)) if len(situation) == 1 else None
+def _make_memory(s: PlanSettings, replan_every: int, warm_start: bool) -> PlanMemory | None:
+    if isinstance(replan_every, bool) or not isinstance(replan_every, int):
+        raise ValueError(f"replan_every: expected an integer, got {replan_every!r}.")
+    if not 1 <= replan_every <= s.planning_horizon:
+        raise ValueError(
+            f"replan_every: expected 1 to planning_horizon={s.planning_horizon}, "
+            f"got {replan_every}."
+        )
+    if warm_start and s.num_policy_candidates == s.num_candidates:
+        raise ValueError(
+            "warm_start: expected random candidates to start from the previous plan, got "
+            f"num_policy_candidates=num_candidates={s.num_candidates}."
+        )
+    needed = replan_every > 1 or warm_start
+    return PlanMemory(replan_every, warm_start) if needed else None

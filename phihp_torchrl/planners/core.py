@@ -2,48 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from phihp_torchrl.planners.scoring import Problem, score_sequences
+from phihp_torchrl.planners.pool import BAD, Plan, Pool, fallback, score_pool, to_pool_layout
+from phihp_torchrl.planners.scoring import Problem
 from phihp_torchrl.planners.settings import PlanSettings
-
-# In here a batch is one dim, B, and comes after the candidates: sequences are [H, N, B, m], so that
-# the actions of a step, and those of the actor's candidates among them, are contiguous rows.
-_BAD = float("-inf")
-
-
-class Plan(NamedTuple):
-    """What planning returns.
-
-    Attributes:
-        actions: the sequence to act with, ``[*batch, H, m]``, in bounds.
-        score: its score ``[*batch]``; where a mean was not scored itself, that of the best sequence
-            met; -inf where no candidate had a finite score.
-    """
-
-    actions: Tensor
-    score: Tensor
-
-
-class Pool(NamedTuple):
-    """Sequences ``[H, N, B, m]`` and their scores ``[N, B]``."""
-
-    actions: Tensor
-    scores: Tensor
-
-    def first(self, count: int) -> Pool:
-        """The first ``count`` of them."""
-        return Pool(self.actions[:, :count], self.scores[:count])
-
-    def where(self, condition: Tensor, other: Pool) -> Pool:
-        """These where ``condition`` ``[N, B]`` holds, else those of ``other``."""
-        return Pool(
-            torch.where(condition[None, ..., None], self.actions, other.actions),
-            torch.where(condition, self.scores, other.scores),
-        )
 
 
 def plan(
@@ -81,7 +47,7 @@ def plan(
     state = problem.model.locate(observation)
     state = state.reshape(-1, *state.shape[len(batch) :])
 
-    start = None if mean is None else _to_pool_layout(mean, rows)
+    start = None if mean is None else to_pool_layout(mean, rows)
     center = bounds.center.expand(s.planning_horizon, 1, rows, action_dim)
     center = center if start is None else start
     std = (s.init_std * bounds.scale).expand(center.shape)
@@ -89,12 +55,12 @@ def plan(
     pool = _first_candidates(state, noise[0], center, std, start is not None, problem, s)
     own = pool.first(1)  # the actor's own sequence, if it proposes any
     compare = s.compare_with_actor and s.num_policy_candidates > 0
-    fallback = _fallback(state, own, center, problem, s)
+    rescue = fallback(state, own if s.num_policy_candidates else None, center, problem)
     best = kept = None
     for iteration_noise in noise.unbind(0):
         if best is not None:
             sampled = bounds.clip(center + std * iteration_noise)
-            pool = _score(state, sampled, problem, s)
+            pool = score_pool(state, sampled, problem, s)
             # Who competes again brings its score along, for the model is deterministic.
             rivals = [*([own] if compare else []), *([kept] if kept is not None else [])]
             if rivals:
@@ -102,55 +68,27 @@ def plan(
                     torch.cat([*(r.actions for r in rivals), pool.actions], 1),
                     torch.cat([*(r.scores for r in rivals), pool.scores], 0),
                 )
-        top, index = pool.scores.topk(s.top_k, dim=0)
-        gather_index = index[None, ..., None].expand(s.planning_horizon, -1, -1, action_dim)
-        elites = Pool(pool.actions.gather(1, gather_index), top)
+        elites, index = pool.best(s.top_k)
         leader = elites.first(1)
         best = leader if best is None else leader.where(leader.scores > best.scores, best)
         if s.num_kept_elites:
             kept = elites.first(s.num_kept_elites)
             if compare:  # the actor's own sequence, the pool's first, competes again anyway
                 again = index[: s.num_kept_elites] == 0
-                kept = Pool(kept.actions, kept.scores.masked_fill(again, _BAD))
+                kept = Pool(kept.actions, kept.scores.masked_fill(again, BAD))
         center, std = _refit(elites, center, std, s.min_std * bounds.scale)
 
     assert best is not None  # there is at least one iteration
     chosen = best if s.select == "best" else Pool(center, best.scores)
     if compare:
         if s.select == "mean":
-            chosen = _score(state, center, problem, s)
+            chosen = score_pool(state, center, problem, s)
         # The actor's wins unless beaten; where neither has a score, the best that had one.
-        rival = own.where(own.scores > _BAD, best)
+        rival = own.where(own.scores > BAD, best)
         chosen = chosen.where(chosen.scores > own.scores + s.actor_margin, rival)
-    chosen = chosen.where(best.scores > _BAD, Pool(fallback, best.scores))
+    chosen = chosen.where(best.scores > BAD, Pool(rescue, best.scores))
     actions = chosen.actions[:, 0].transpose(0, 1)
     return Plan(actions.reshape(*batch, *actions.shape[1:]), chosen.scores.reshape(batch))
-
-
-def _to_pool_layout(sequences: Tensor, rows: int) -> Tensor:
-    """``[*batch, H, m] -> [H, 1, B, m]``."""
-    return sequences.reshape(rows, *sequences.shape[-2:]).transpose(0, 1).unsqueeze(1)
-
-
-def _score(
-    state: Any,
-    actions: Tensor,
-    problem: Problem,
-    settings: PlanSettings,
-    policy_noise: Tensor | None = None,
-) -> Pool:
-    """Score sequences ``[H, N, B, m]`` from the states ``[B, n]``; the first may be the actor's."""
-    shape = actions.shape
-    repeated = state.expand(shape[1], *state.shape).reshape(-1, *state.shape[1:])
-    scores, actions = score_sequences(
-        repeated,
-        actions.reshape(shape[0], -1, shape[-1]),
-        problem,
-        gamma=settings.gamma,
-        alpha=settings.alpha,
-        policy_noise=None if policy_noise is None else policy_noise.flatten(1, 2),
-    )
-    return Pool(actions.view(shape), scores.view(shape[1:3]))
 
 
 def _first_candidates(
@@ -168,25 +106,11 @@ def _first_candidates(
     if center_competes and guided < settings.num_candidates:
         actions = torch.cat([actions[:, :guided], center, actions[:, guided + 1 :]], 1)
     if not guided:
-        return _score(state, actions, problem, settings)
+        return score_pool(state, actions, problem, settings)
     policy_noise = (settings.policy_noise * noise[:, :guided]).clamp(-limit, limit)
     policy_noise = policy_noise * problem.bounds.scale
     policy_noise = torch.cat([torch.zeros_like(center), policy_noise[:, 1:]], 1)
-    return _score(state, actions, problem, settings, policy_noise)
-
-
-def _fallback(
-    state: Any, own: Pool, center: Tensor, problem: Problem, settings: PlanSettings
-) -> Tensor:
-    """What to do where every score is bad, ``[H, 1, B, m]``: the actor's, else the center."""
-    if problem.actor is None:
-        return center
-    if settings.num_policy_candidates:
-        actions = own.actions
-    else:
-        action = problem.bounds.clip(problem.actor(problem.model.observe(state)))
-        actions = torch.cat([action.expand_as(center[:1]), center[1:]])
-    return torch.where(actions.isfinite(), actions, center)
+    return score_pool(state, actions, problem, settings, policy_noise)
 
 
 def _refit(elites: Pool, center: Tensor, std: Tensor, min_std: Tensor) -> tuple[Tensor, Tensor]:
@@ -194,7 +118,7 @@ def _refit(elites: Pool, center: Tensor, std: Tensor, min_std: Tensor) -> tuple[
 
     The best elite stands in for bad ones; where it is bad itself, all stays as it was.
     """
-    good = (elites.scores > _BAD)[None, ..., None]
+    good = (elites.scores > BAD)[None, ..., None]
     actions = torch.where(good, elites.actions, elites.actions[:, :1])
     variance, mean = torch.var_mean(actions, dim=1, keepdim=True, correction=0)
     new_std = torch.maximum(variance.sqrt(), min_std)

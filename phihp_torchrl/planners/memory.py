@@ -46,7 +46,7 @@ class PlanMemory:
         """
         cold = center.expand(*batch, *center.shape)
         plans, age = self._plans, self._age
-        if plans is None or age is None or plans.shape != cold.shape or plans.device != cold.device:
+        if plans is None or age is None or not self._fits(cold):
             plans = plan(cold if self.warm_start else None)
             age = torch.zeros(batch, dtype=torch.long, device=plans.device)
         else:
@@ -55,14 +55,30 @@ class PlanMemory:
                 age = age.masked_fill(is_init, self.replan_every)
             due = age >= self.replan_every
             if self.replan_every == 1 or due.any():
-                mean = None
-                if self.warm_start:
-                    rest = plans[..., self.replan_every :, :]
-                    mean = torch.cat([rest, cold[..., : self.replan_every, :]], -2)
-                    if is_init is not None:
-                        mean = torch.where(is_init[..., None, None], cold, mean)
+                mean = self.recall(is_init, cold) if self.warm_start else None
                 plans = torch.where(due[..., None, None], plan(mean), plans)
                 age = age.masked_fill(due, 0)
         self._plans, self._age = plans, age
         index = age[..., None, None].expand(*batch, 1, center.shape[-1])
         return plans.gather(-2, index).squeeze(-2)
+
+    def recall(self, is_init: Tensor | None, cold: Tensor) -> Tensor:
+        """The last plan shifted by ``replan_every``, to start the next from, ``[*batch, H, m]``.
+
+        Args:
+            is_init: where an episode starts, bool ``[*batch]``, if known.
+            cold: what comes after its end, and in its place where there is none.
+        """
+        if self._plans is None or not self._fits(cold):
+            return cold
+        rest = self._plans[..., self.replan_every :, :]
+        mean = torch.cat([rest, cold[..., : self.replan_every, :]], -2)
+        return mean if is_init is None else torch.where(is_init[..., None, None], cold, mean)
+
+    def remember(self, plans: Tensor) -> None:
+        """Keep ``plans`` ``[*batch, H, m]`` for :meth:`recall`, at once."""
+        self._plans = plans
+
+    def _fits(self, cold: Tensor) -> bool:
+        plans = self._plans
+        return plans is not None and plans.shape == cold.shape and plans.device == cold.device

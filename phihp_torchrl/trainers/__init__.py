@@ -19,6 +19,7 @@ from phihp_torchrl.trainers.run_config import (
 )
 from phihp_torchrl.trainers.show import show_episode
 from phihp_torchrl.trainers.td3 import RealTD3Config, RealTD3Trainer
+from phihp_torchrl.trainers.tdmpc import TDMPCTrainConfig, TDMPCTrainer
 
 __all__ = [
     "METHODS",
@@ -38,6 +39,8 @@ __all__ = [
     "RunRequest",
     "RunResult",
     "StartConfig",
+    "TDMPCTrainConfig",
+    "TDMPCTrainer",
     "from_mapping",
     "get_method",
     "import_plugins",

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-ACTING = ("hybrid_planner", "plain_planner", "actor")
-"""Planning with actor and Q, planning without them, or the actor alone."""
+ACTING = ("hybrid_planner", "plain_planner", "actor", "own_planner")
+"""Planning with actor and Q, without them, the actor alone, or a planner that a phase brings."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Method:
     @property
     def plans(self) -> bool:
         """Whether its agent acts by the planner of section ``planner``."""
-        return self.acting != "actor"
+        return self.acting in ("hybrid_planner", "plain_planner")
 
     @property
     def sections(self) -> tuple[str, ...]:
@@ -61,6 +61,7 @@ METHODS = {
     "td-mpc-star": Method("TD-MPC*", _REAL, model_kind="data_driven"),
     "ph-cem": Method("Ph-CEM", _PLANNED, acting="plain_planner", model_kind="hybrid"),
     "dd-cem": Method("dd-CEM", _PLANNED, acting="plain_planner", model_kind="data_driven"),
+    "td-mpc": Method("TD-MPC", ("tdmpc", "evaluate"), acting="own_planner"),
     "cem-oracle": Method("CEM-oracle", _PLANNED, acting="plain_planner", model_kind="oracle"),
 }
 """Methods by name; a plugin may add its own with :func:`register_method`."""

@@ -19,6 +19,7 @@ from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
 from phihp_torchrl.trainers.show import show_episode
 from phihp_torchrl.trainers.td3 import RealTD3Trainer
+from phihp_torchrl.trainers.tdmpc import TDMPCTrainer
 
 T = TypeVar("T")
 
@@ -28,7 +29,7 @@ class Phase(Protocol):
 
     A phase that takes real steps counts them in an attribute ``real_steps``; one that learns a part
     of the agent returns it from a method ``parts``, as an argument of
-    :class:`~phihp_torchrl.deployment.Agent` by name.
+    :class:`~phihp_torchrl.deployment.Agent` by name, or the whole of it as ``agent``.
     """
 
     @property
@@ -204,12 +205,20 @@ def _make_td3(context: Context) -> Phase:
     )
 
 
+def _make_tdmpc(context: Context) -> Phase:
+    config = context.config
+    return TDMPCTrainer(
+        context.task, _given(config.tdmpc), seed=config.seed, compile=config.compile
+    )
+
+
 def _make_evaluate(context: Context) -> Phase:
     parts: dict[str, Any] = {}
     for phase in context.before.values():
         parts |= phase.parts()
-    config = context.config
-    agent = Agent(context.task, **parts, planner_config=config.planner, compile=config.compile)
+    config, agent = context.config, parts.get("agent")
+    if agent is None:
+        agent = Agent(context.task, **parts, planner_config=config.planner, compile=config.compile)
     samples = real_steps(context.before)
     return EvaluatePhase(agent, config, context.directory, samples)
 
@@ -218,6 +227,7 @@ PHASE_KINDS = {
     "model": PhaseKind(_make_model, "steps"),
     "policy": PhaseKind(_make_policy, "updates"),
     "td3": PhaseKind(_make_td3, "steps"),
+    "tdmpc": PhaseKind(_make_tdmpc, "steps"),
     "evaluate": PhaseKind(_make_evaluate, "parts"),
 }
 """Phases by name; a method is a sequence of these."""

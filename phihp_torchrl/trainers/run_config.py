@@ -24,8 +24,9 @@ from phihp_torchrl.trainers.model import ModelConfig
 from phihp_torchrl.trainers.policy import PolicyConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.trainers.td3 import RealTD3Config
+from phihp_torchrl.trainers.tdmpc import TDMPCTrainConfig
 
-SECTIONS = ("model", "policy", "td3", "planner")
+SECTIONS = ("model", "policy", "td3", "tdmpc", "planner")
 """The sections of a configuration that a method may have no use for."""
 
 FREE_KEYS = ("checkpoint_interval", "keep_checkpoints", "progress", "logger")
@@ -81,6 +82,7 @@ class RunConfig:
         model: the phase that learns a model from real steps.
         policy: the phase that learns actor and critics in imagination.
         td3: the phase that learns actor and critics from real steps.
+        tdmpc: the phase that learns all of TD-MPC from real steps.
         planner: how the agent plans.
         evaluate: the phase that judges the agent.
         logger: where metrics go besides ``metrics.csv``.
@@ -101,6 +103,7 @@ class RunConfig:
     model: ModelConfig | None = field(default_factory=ModelConfig)
     policy: PolicyConfig | None = field(default_factory=PolicyConfig)
     td3: RealTD3Config | None = field(default_factory=RealTD3Config)
+    tdmpc: TDMPCTrainConfig | None = field(default_factory=TDMPCTrainConfig)
     planner: PlannerConfig | None = field(default_factory=PlannerConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)
     logger: LoggerConfig = field(default_factory=LoggerConfig)

@@ -1,0 +1,273 @@
+"""What planners that sample and refit share as TorchRL modules: keys, parts, backends, memory."""
+
+from __future__ import annotations
+
+import logging
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import MPCPlannerBase
+
+from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.planners.env_model import (
+    EnvModel,
+    find_action,
+    find_done,
+    find_limits,
+    find_reward,
+    find_situation,
+)
+from phihp_torchrl.planners.functions import actor_function, value_function
+from phihp_torchrl.planners.memory import PlanMemory
+from phihp_torchrl.planners.scoring import ActionBounds, Problem, TensorModel
+from phihp_torchrl.planners.settings import SearchSettings
+
+_logger = logging.getLogger(__name__)
+
+
+class SamplingPlanner(MPCPlannerBase):
+    """A planner that scores sampled sequences in a model: all but the plan itself.
+
+    :class:`~phihp_torchrl.CEMPlanner` and :class:`~phihp_torchrl.planners.MPPIPlanner` are such,
+    and document the arguments.
+
+    Args:
+        env: the model to plan on.
+        settings: the numbers of the search.
+        plan: the plan as a pure function, with ``problem`` and ``settings`` among its keywords.
+        memory: what carries over from one step to the next, or ``None``.
+        reward_key: where a step leaves the reward.
+        action_key: the action.
+        actor: the policy, or ``None``.
+        qvalue: the critics, or ``None``.
+        observation_key: what the tensor model is given.
+        done_keys: after which flags of a step nothing counts any more.
+        value_key: what ``qvalue`` writes.
+        is_init_key: true where an episode starts.
+        backend: ``"tensor"``, ``"env"`` or ``"auto"``.
+        compile: whether to compile the plan.
+        generator: source of the noise.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        settings: SearchSettings,
+        plan: Callable[..., Any],
+        memory: PlanMemory | None,
+        reward_key: NestedKey,
+        action_key: NestedKey,
+        *,
+        actor: TensorDictModuleBase | None,
+        qvalue: TensorDictModuleBase | None,
+        observation_key: NestedKey | None,
+        done_keys: NestedKey | Sequence[NestedKey] | None,
+        value_key: NestedKey,
+        is_init_key: NestedKey,
+        backend: str,
+        compile: bool | dict[str, Any],
+        generator: torch.Generator | None,
+    ) -> None:
+        action_key, reward_key = unravel_key(action_key), unravel_key(reward_key)
+        action_spec = find_action(env, action_key)
+        super().__init__(env, action_key=action_key)
+        self.action_spec = action_spec
+        self.settings = settings
+        self.action_key, self.reward_key = action_key, find_reward(env, reward_key)
+        self.value_key, self.is_init_key = unravel_key(value_key), unravel_key(is_init_key)
+        self.done_keys = find_done(env, done_keys)
+        situation = find_situation(env)
+        self.observation_key = _choose(situation, observation_key)
+        self.actor, self.qvalue = actor, qvalue
+        self.generator = generator
+        self._check_modules(situation)
+        low, high = find_limits(action_spec)
+        self.register_buffer("_action_low", low, persistent=False)
+        self.register_buffer("_action_high", high, persistent=False)
+        self.memory = memory
+        self._choose_backend(backend, done_keys is None, bool(compile))
+        # A tensor model finds the state from one observation, on either path.
+        self.in_keys = list(situation)
+        if self._has_tensor_model() and self.observation_key is not None:
+            self.in_keys = list(dict.fromkeys([self.observation_key, *self._module_keys()]))
+        self._expected = {key: situation[key] for key in self.in_keys}
+        self._compile = compile
+        self._plan = plan
+        self._planning_function: Callable[..., Any] | None = None
+
+    # Construction: what fits together.
+
+    def _has_tensor_model(self) -> bool:
+        # A transformed environment lends its base's attributes, and its transforms would be lost.
+        return (
+            not isinstance(self.env, TransformedEnv)
+            and getattr(self.env, "tensor_model", None) is not None
+        )
+
+    def _module_keys(self) -> list[NestedKey]:
+        """What actor and critics read besides the action."""
+        modules = [module for module in (self.actor, self.qvalue) if module is not None]
+        keys = [unravel_key(key) for module in modules for key in module.in_keys]
+        return [key for key in keys if key != self.action_key]
+
+    def _why_not_tensors(self, default_done_keys: bool) -> str | None:
+        """Why the environment must be stepped, if so."""
+        if not self._has_tensor_model():
+            return f"{type(self.env).__name__} has no tensor_model of its own"
+        if self.observation_key is None:
+            return "it has several observations and observation_key does not say which to take"
+        if self.reward_key != ("next", "reward") or not default_done_keys:
+            return "reward_key or done_keys are not those of its tensor_model"
+        if others := set(self._module_keys()) - {self.observation_key}:
+            return f"actor or qvalue read {sorted(others, key=str)}, not {self.observation_key!r}"
+        return None
+
+    def _choose_backend(self, backend: str, default_done_keys: bool, compile: bool) -> None:
+        if backend not in ("auto", "tensor", "env"):
+            raise ValueError(f"backend: expected 'auto', 'tensor' or 'env', got {backend!r}.")
+        reason = self._why_not_tensors(default_done_keys)
+        if backend == "tensor" and reason:
+            raise ValueError(f"backend: expected 'env' or 'auto', got 'tensor', but {reason}.")
+        if self.env.batch_size and not self._has_tensor_model():
+            raise ValueError(f"env: expected batch size [], got {list(self.env.batch_size)}.")
+        self.uses_tensors = backend != "env" and not reason
+        if not self.uses_tensors:
+            _logger.log(
+                logging.WARNING if compile else logging.INFO,
+                "%s steps the environment%s: %s.",
+                type(self).__name__,
+                ", which is not compiled" if compile else "",
+                reason or "backend='env'",
+            )
+        elif compile and not getattr(self.env.tensor_model, "compiles", True):
+            _logger.warning(
+                "%s is not compiled: the model's integrator does not compile.", type(self).__name__
+            )
+            compile = False
+        self._compiles = compile and self.uses_tensors
+
+    def _check_modules(self, situation: Collection[NestedKey]) -> None:
+        actor, qvalue = self.actor, self.qvalue
+        if actor is None and self.settings.num_policy_candidates:
+            raise ValueError(
+                "actor: expected a module to propose num_policy_candidates="
+                f"{self.settings.num_policy_candidates} sequences, got None."
+            )
+        if actor is None and qvalue is not None:
+            raise ValueError(
+                "actor: expected a module to act beyond the horizon, for qvalue, got None."
+            )
+        for name, module, key in (
+            ("actor", actor, self.action_key),
+            ("qvalue", qvalue, self.value_key),
+        ):
+            if module is None:
+                continue
+            if key not in (keys := getattr(module, "out_keys", [])):
+                raise ValueError(
+                    f"{name}: expected a TensorDict module that writes {key!r}, "
+                    f"got {type(module).__name__} that writes {list(keys)}."
+                )
+            allowed = [*situation, *([self.action_key] if module is qvalue else [])]
+            if unknown := [k for k in module.in_keys if unravel_key(k) not in allowed]:
+                raise ValueError(f"{name}: expected in_keys among {allowed}, got {unknown}.")
+
+    def _build(self) -> Callable[..., Any]:
+        """The plan as a function of observation, noise and mean."""
+        action_shape = self.action_spec.shape
+        if self.uses_tensors:
+            model: TensorModel = self.env.tensor_model
+        else:
+            model = EnvModel(
+                self.env, self.action_key, action_shape, self.reward_key, self.done_keys
+            )
+        actor = value = None
+        if self.actor is not None:
+            actor = actor_function(self.actor, self.action_key, action_shape.numel())
+        if self.qvalue is not None:
+            value = value_function(self.qvalue, self.value_key, self.action_key, action_shape)
+        bounds = ActionBounds.from_limits(self._action_low, self._action_high)
+        problem = Problem(model=model, bounds=bounds, actor=actor, value=value)
+        function = partial(self._plan, problem=problem, settings=self.settings)
+        options = dict(self._compile) if isinstance(self._compile, dict) else {}
+        return compile_graph(function, enabled=self._compiles, **options)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The function holds on to these very modules, so a copy builds its own.
+        return {**super().__getstate__(), "_planning_function": None}
+
+    def _apply(self, *args: Any, **kwargs: Any) -> SamplingPlanner:
+        self._planning_function = None  # it holds the bounds as they were
+        return super()._apply(*args, **kwargs)
+
+    # Planning.
+
+    @abstractmethod
+    def planning(self, tensordict: TensorDictBase) -> Tensor:
+        """The action ``[*batch, *action_shape]`` for ``tensordict``."""
+
+    def reset(self) -> None:
+        """Forget the previous plan: a new episode starts."""
+        if self.memory is not None:
+            self.memory.clear()
+
+    @property
+    def bounds(self) -> ActionBounds:
+        """Where actions may be."""
+        return ActionBounds.from_limits(self._action_low, self._action_high)
+
+    def _call_plan(self, tensordict: TensorDictBase, *args: Any) -> Any:
+        """Call the plan with what it is made from, and further arguments."""
+        if self._planning_function is None:
+            self._planning_function = self._build()
+        if self.uses_tensors:
+            observation = tensordict.get(self.observation_key)
+        else:
+            observation = tensordict.select(*self.in_keys)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            return self._planning_function(observation, *args)
+
+    def _starts(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Where an episode starts, bool ``[*batch]``, if it is known."""
+        is_init = tensordict.get(self.is_init_key, None)
+        return None if is_init is None else is_init.reshape(tensordict.batch_size)
+
+    def _draw(self, *shape: int) -> Tensor:
+        """Standard normal noise."""
+        low = self._action_low
+        return torch.randn(shape, generator=self.generator, dtype=low.dtype, device=low.device)
+
+    def _check_observation(self, tensordict: TensorDictBase) -> None:
+        batch, device = tensordict.batch_size, self._action_low.device
+        for key, spec in self._expected.items():
+            value = tensordict.get(key, None)
+            shape = torch.Size([*batch, *spec.shape])
+            if value is None:
+                raise ValueError(f"{key}: expected a tensor of shape {list(shape)}, got none.")
+            if value.shape != shape or value.dtype != spec.dtype or value.device != device:
+                raise ValueError(
+                    f"{key}: expected {spec.dtype} of shape {list(shape)} on {device}, "
+                    f"got {value.dtype} of shape {list(value.shape)} on {value.device}."
+                )
+            # Elsewhere this would wait for the device; the plan falls back to the actor's action.
+            if device.type == "cpu" and not value.isfinite().all():
+                raise ValueError(f"{key}: expected finite observations, got some that are not.")
+
+
+def _choose(situation: Collection[NestedKey], key: NestedKey | None) -> NestedKey | None:
+    """The observation that a tensor model is given, if it is clear which."""
+    if key is not None:
+        if unravel_key(key) not in situation:
+            raise ValueError(f"observation_key: expected one of {list(situation)}, got {key!r}.")
+        return unravel_key(key)
+    if "observation" in situation:
+        return "observation"
+    return next(iter(situation)) if len(situation) == 1 else None

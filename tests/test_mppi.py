@@ -1,0 +1,386 @@
+"""Planning by path integral control, by hand, by property and by contract."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp, inf, nan, sqrt
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs import check_env_specs
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from phihp_torchrl import HybridDynamics, WorldModelEnv, get_task
+from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.envs import LatentEnv
+from phihp_torchrl.planners import (
+    ActionBounds,
+    MPPINoise,
+    MPPIPlanner,
+    MPPISettings,
+    Problem,
+    mppi_plan,
+)
+from phihp_torchrl.planners.factory import MPPIConfig
+from phihp_torchrl.planners.mppi_core import elite_weights
+
+torch.set_num_threads(1)
+
+
+class Point:
+    """A point on a plane that moves by its action and wants to be at ``goal``."""
+
+    def __init__(self, goal=0.3, wall=inf, reward=None):
+        self.goal, self.wall, self.reward = goal, wall, reward
+
+    def locate(self, observation):
+        return observation
+
+    def observe(self, state):
+        return state
+
+    def transition(self, state, action):
+        next_state = state + action
+        reward = -(next_state - self.goal).square().sum(-1)
+        if self.reward is not None:
+            reward = self.reward(state, action, reward)
+        return next_state, reward, (next_state.abs() > self.wall).any(-1)
+
+
+def half_way(observation):
+    return 0.5 * (0.3 - observation)
+
+
+def problem(actor=None, value=None, low=(-1.0, -0.5), high=(1.0, 0.75), **kwargs):
+    low, high = (torch.tensor(t, dtype=torch.float64) for t in (low, high))
+    bounds = ActionBounds.from_limits(low, high)
+    return Problem(model=Point(**kwargs), bounds=bounds, actor=actor, value=value)
+
+
+def settings(**kwargs):
+    defaults = {
+        "planning_horizon": 4,
+        "optim_steps": 4,
+        "num_candidates": 60,
+        "top_k": 8,
+        "num_policy_candidates": 0,
+        "init_std": 1.0,
+        "select": "mean",
+    }
+    return MPPISettings(**{**defaults, **kwargs})
+
+
+def draw(s, batch=(), seed=0, action_dim=2):
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    guided = s.num_policy_candidates
+    return MPPINoise(
+        normal(s.optim_steps, s.planning_horizon, s.num_candidates - guided, *batch, action_dim),
+        normal(s.planning_horizon, guided, *batch, action_dim),
+        torch.rand(s.top_k, *batch, generator=generator, dtype=torch.float64),
+    )
+
+
+def plan(state, noise, s, mean=None, **kwargs):
+    min_std = torch.tensor(s.min_std, dtype=torch.float64)
+    return mppi_plan(state, noise, mean, min_std, problem=problem(**kwargs), settings=s)
+
+
+ZEROS = torch.zeros(2, dtype=torch.float64)
+
+
+# By hand.
+
+
+def test_elite_weights_by_hand():
+    """Temperature 0.5 and scores 2 apart: 1, 1/e, normalised; a bad score has no weight."""
+    weights = elite_weights(torch.tensor([[3.0], [1.0], [-inf]]), 0.5)
+    expected = torch.tensor([1.0, exp(-1.0), 0.0]) / (1 + exp(-1.0))
+    torch.testing.assert_close(weights[:, 0], expected)
+    assert elite_weights(torch.full((4, 1), -inf), 0.5).tolist() == [[0.25]] * 4
+    assert elite_weights(torch.tensor([[3.0], [1.0]]), 0.0).tolist() == [[0.5], [0.5]]
+
+
+def one_step(momentum=0.0, min_std=0.0, select="mean", choice=(0.5, 0.5), mean=None):
+    """Candidates 0.3, -0.1 and 0.9 around zero, of which the first two are the elites."""
+    s = settings(
+        planning_horizon=1,
+        optim_steps=1,
+        num_candidates=3,
+        top_k=2,
+        momentum=momentum,
+        min_std=min_std,
+        temperature=2.0,
+        select=select,
+    )
+    samples = torch.tensor([0.3, -0.1, 0.9], dtype=torch.float64).reshape(1, 1, 3, 1)
+    noise = MPPINoise(samples, samples[0, :, :0], torch.tensor(choice, dtype=torch.float64))
+    state = torch.zeros(1, dtype=torch.float64)
+    return plan(state, noise, s, mean, low=(-1.0,), high=(1.0,))
+
+
+# Goal 0.3: the scores are 0 and -0.16, so the weights 1 and e^(-0.32), normalised.
+W = 1 / (1 + exp(-0.32))
+MEAN = 0.3 * W - 0.1 * (1 - W)
+STD = sqrt(W * (0.3 - MEAN) ** 2 + (1 - W) * (-0.1 - MEAN) ** 2)
+
+
+def test_refit_by_hand():
+    found = one_step()
+    torch.testing.assert_close(found.mean.item(), MEAN)
+    torch.testing.assert_close(found.std.item(), STD)
+    assert found.actions.item() == found.mean.item()
+    assert found.score.item() == 0.0
+
+
+def test_momentum_and_the_limits_of_the_std_by_hand():
+    mean = torch.full((1, 1), 0.0, dtype=torch.float64)
+    found = one_step(momentum=0.25, min_std=0.5, mean=mean)
+    torch.testing.assert_close(found.mean.item(), 0.75 * MEAN)
+    assert found.std.item() == 0.5
+    # Around 0.2 the three candidates are 0.5, 0.1 and 1 (clipped): 0.5 and 0.1 score the same.
+    shifted = one_step(mean=mean + 0.2, momentum=0.5)
+    torch.testing.assert_close(shifted.mean.item(), 0.5 * 0.2 + 0.5 * 0.3)
+
+
+def test_the_elite_to_act_with_is_drawn_by_its_weight():
+    draws = torch.rand(4000, 2, generator=torch.Generator().manual_seed(0))
+    actions = [one_step(select="sample", choice=c).actions.item() for c in draws.tolist()]
+    share = sum(action == 0.3 for action in actions) / len(actions)
+    assert set(actions) == {0.3, -0.1}
+    assert abs(share - W) < 4 * sqrt(W * (1 - W) / len(actions))
+
+
+# By property.
+
+
+def test_more_budget_is_no_worse_on_a_quadratic():
+    state = torch.randn(50, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def score(**kwargs):
+        s = settings(**kwargs)
+        actions = plan(state, draw(s, (50,)), s).actions
+        p, total, now = problem(), 0.0, state
+        for k in range(4):
+            now, reward, _ = p.model.transition(now, actions[:, k])
+            total = total + 0.99**k * reward
+        return total.mean().item()
+
+    small, more_steps = score(optim_steps=1), score(optim_steps=6)
+    more_candidates = score(optim_steps=1, num_candidates=600)
+    both = score(optim_steps=6, num_candidates=600)
+    assert small < more_steps <= both + 1e-3
+    assert small < more_candidates <= both + 1e-3
+
+
+@pytest.mark.parametrize("select", ["sample", "mean"])
+@pytest.mark.parametrize("guided", [0, 10])
+def test_plans_stay_in_bounds(select, guided):
+    s = settings(num_policy_candidates=guided, init_std=2.0, select=select, policy_noise=5.0)
+    far = torch.full((7, 2), 50.0, dtype=torch.float64)
+    found = plan(far, draw(s, (7,)), s, actor=half_way, goal=-99.0)
+    low, high = torch.tensor([-1.0, -0.5]), torch.tensor([1.0, 0.75])
+    assert ((found.actions >= low) & (found.actions <= high)).all()
+    assert (found.std > 0).all()
+
+
+def test_the_order_of_candidates_changes_nothing():
+    s = settings(num_policy_candidates=10)
+    noise = draw(s, (3,))
+    order = torch.randperm(50, generator=torch.Generator().manual_seed(5))
+    other = noise._replace(samples=noise.samples[:, :, order])
+    state = torch.zeros(3, 2, dtype=torch.float64)
+    plans = [plan(state, n, s, actor=half_way) for n in (noise, other)]
+    torch.testing.assert_close(*(p.mean for p in plans))
+    torch.testing.assert_close(*(p.std for p in plans))
+
+
+@pytest.mark.parametrize("guided", [0, 10])
+def test_splitting_a_batch_changes_nothing(guided):
+    s = settings(num_policy_candidates=guided, select="sample")
+    noise = draw(s, (2, 3))
+    state = torch.randn(2, 3, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    mean = torch.full((2, 3, 4, 2), 0.1, dtype=torch.float64)
+    whole = plan(state, noise, s, mean, actor=half_way)
+    assert whole.actions.shape == (2, 3, 4, 2)
+    for i in range(2):
+        for j in range(3):
+            own = MPPINoise(
+                noise.samples[:, :, :, i, j], noise.policy[:, :, i, j], noise.choice[:, i, j]
+            )
+            single = plan(state[i, j], own, s, mean[i, j], actor=half_way)
+            for one, all_of_them in zip(single, whole, strict=True):
+                torch.testing.assert_close(one, all_of_them[i, j])
+
+
+def test_the_actors_sequences_compete():
+    """A good actor and candidates that hardly move: what wins is the actor's."""
+    s = settings(num_policy_candidates=10, init_std=0.01, min_std=0.001, policy_noise=0.01)
+    start = torch.full((2,), 0.9, dtype=torch.float64)
+    with_actor = plan(start, draw(s), s, actor=half_way)
+    without = plan(
+        start, draw(s), replace(s, num_policy_candidates=0, num_candidates=50), actor=None
+    )
+    assert with_actor.score > without.score + 0.5
+    torch.testing.assert_close(with_actor.mean[0], half_way(start), atol=0.05, rtol=0)
+
+
+def test_nothing_counts_after_a_termination():
+    """Beyond the wall rewards are enormous, but the episode is over there."""
+
+    def reward(state, action, reward):
+        return torch.where((state.abs() > 0.5).any(-1), 1e6, reward)
+
+    s = settings()
+    assert plan(ZEROS, draw(s), s, wall=0.5, reward=reward).score < 0
+    assert plan(ZEROS, draw(s), s, reward=reward).score > 1e5
+
+
+@pytest.mark.parametrize("bad", [nan, inf, -inf])
+def test_scores_that_are_not_finite_never_win(bad):
+    def reward(state, action, reward):
+        return torch.where(action[..., 0] > 0, bad, reward)
+
+    s = settings(select="sample")
+    found = plan(ZEROS, draw(s), s, reward=reward)
+    assert found.score.isfinite()
+    assert (found.actions[:, 0] <= 0).all()
+    nothing = plan(ZEROS, draw(s), s, actor=half_way, reward=lambda *_: torch.tensor(bad))
+    torch.testing.assert_close(nothing.actions[0], half_way(ZEROS))
+    assert nothing.score == -inf
+
+
+# By contract.
+
+
+def make_planner(**kwargs):
+    task = get_task("pendulum-swingup")
+    env = WorldModelEnv(TaskWorldModel(task, HybridDynamics.oracle(task)), seed=0)
+    options = {k: kwargs.pop(k) for k in ("backend", "generator") if k in kwargs}
+    s = settings(num_candidates=32, top_k=4, select="sample", **kwargs)
+    return MPPIPlanner(env, s, **options)
+
+
+def situation(*batch, seed=0):
+    task = get_task("pendulum-swingup")
+    generator = torch.Generator().manual_seed(seed)
+    state = task.reset.sample([*batch], generator=generator)
+    return TensorDict(observation=task.system.observe(state), state=state, batch_size=batch)
+
+
+def test_both_backends_agree():
+    task = get_task("cartpole")
+    env = WorldModelEnv(TaskWorldModel(task, HybridDynamics.oracle(task)), seed=0)
+    planners = [MPPIPlanner(env, settings(), backend=b) for b in ("tensor", "env")]
+    state = task.reset.sample([3], generator=torch.Generator().manual_seed(0))
+    td = TensorDict(observation=task.system.observe(state), state=state, batch_size=[3])
+    noise = planners[0].draw_noise([3])
+    plans = [planner.plan(td, noise) for planner in planners]
+    for a, b in zip(*plans, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_a_plan_starts_from_the_one_before_shifted():
+    planner = make_planner(momentum=0.9)
+    td = situation(2)
+    seen = []
+    plan_once = planner.plan
+
+    def spy(tensordict, noise, mean):
+        seen.append(mean)
+        return plan_once(tensordict, noise, mean)
+
+    planner.plan = spy
+    planner(td.clone())
+    first = planner.memory.recall(None, torch.zeros(2, 4, 1))
+    planner(td.clone())
+    assert not seen[0].any()
+    torch.testing.assert_close(seen[1], first)
+    assert seen[1][:, :3].any()
+    assert not seen[1][:, 3].any()
+    planner(td.clone().set("is_init", torch.tensor([[True], [False]])))
+    assert not seen[2][0].any()
+    assert seen[2][1].any()
+    planner.reset()
+    planner(td.clone())
+    assert not seen[3].any()
+
+
+def test_exploration_is_noise_of_the_std_that_is_left():
+    """Deterministic is the default; RANDOM adds noise, which is clipped to the bounds."""
+    planner = make_planner(min_std=0.9, generator=torch.Generator())
+    actions = {}
+    for kind in (ExplorationType.DETERMINISTIC, ExplorationType.RANDOM):
+        planner.generator.manual_seed(3)
+        planner.reset()
+        with set_exploration_type(kind):
+            actions[kind] = planner(situation(400))["action"]
+    noise = actions[ExplorationType.RANDOM] - actions[ExplorationType.DETERMINISTIC]
+    assert noise.std() > 0.5
+    assert (actions[ExplorationType.RANDOM].abs() <= 2.0).all()
+
+
+def test_the_schedule_is_linear_and_can_be_assigned():
+    config = MPPIConfig(num_candidates=32, top_k=4, num_policy_candidates=0)
+    assert [config.at(n).planning_horizon for n in (0, 6249, 6250, 24_999, 25_000, 10**6)] == [
+        1, 1, 2, 4, 5, 5,
+    ]  # fmt: skip
+    assert [config.at(n).min_std for n in (0, 25_000, 10**6)] == [0.5, 0.05, 0.05]
+    assert config.at(12_500).min_std == pytest.approx(0.275)
+    assert type(config.at(0)) is MPPISettings
+    planner = make_planner()
+    assert planner.plan(situation(2)).mean.shape == (2, 4, 1)
+    planner.settings = config.at(12_500)
+    assert planner.plan(situation(2)).mean.shape == (2, 3, 1)
+    planner(situation(2))
+    planner.settings = replace(config.at(25_000), optim_steps=1, top_k=2)
+    assert planner(situation(2))["action"].shape == (2, 1)
+    assert planner.plan(situation(2)).mean.shape == (2, 5, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("temperature", -1.0),
+        ("momentum", 1.0),
+        ("select", "best"),
+        ("min_std", 3.0),
+        ("num_policy_candidates", 60),
+        ("top_k", 61),
+        ("gamma", 1.5),
+    ],
+)
+def test_settings_out_of_range_are_named(name, value):
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        settings(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("initial_horizon", 6), ("initial_min_std", 0.01), ("schedule_steps", -1)]
+)
+def test_schedules_out_of_range_are_named(name, value):
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        MPPIConfig(**{name: value})
+
+
+def test_a_bad_observation_is_named():
+    with pytest.raises(ValueError, match="observation: expected"):
+        make_planner()(TensorDict(observation=torch.zeros(2, 5), batch_size=[2]))
+
+
+def test_latent_env_keeps_its_contract():
+    env = LatentEnv(Point(wall=2.0), 2, torch.ones(2), start=lambda shape: torch.zeros(*shape, 2))
+    check_env_specs(env)
+    actor = TensorDictModule(half_way, ["latent"], ["action"])
+    planners = [
+        MPPIPlanner(env, settings(num_policy_candidates=10), actor=actor, backend=b)
+        for b in ("tensor", "env")
+    ]
+    td = TensorDict(latent=torch.full((3, 2), 0.8), batch_size=[3])
+    noise = planners[0].draw_noise([3])
+    torch.testing.assert_close(*(p.plan(td, noise).actions for p in planners))
