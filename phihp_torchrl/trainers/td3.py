@@ -193,7 +193,8 @@ class RealTD3Trainer:
 
     def evaluate(self) -> Tensor:
         """Returns ``[evaluation_episodes]`` of the noise-free actor in the real world."""
-        return self.world.returns(self.update.actor, self._evaluation_states, self.task.max_steps)
+        states, steps = self._evaluation_states, self.task.max_steps
+        return self.world.returns(self.update.actor, states, steps).total
 
     def parts(self) -> dict[str, Any]:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""
