@@ -194,7 +194,7 @@ class RealTD3Trainer:
     def evaluate(self) -> Tensor:
         """Returns ``[evaluation_episodes]`` of the noise-free actor in the real world."""
         states, steps = self._evaluation_states, self.task.max_steps
-        return self.world.returns(self.update.actor, states, steps).total
+        return self.world.returns(self.update.networks.actor, states, steps).total
 
     def parts(self) -> dict[str, Any]:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""
@@ -233,7 +233,7 @@ class RealTD3Trainer:
             random_fraction=0.0 if warm else 1.0,
             generator=self.generator,
         )
-        batch, self.worlds = self.world.chunk(self.update.actor, self.worlds, noise)
+        batch, self.worlds = self.world.chunk(self.update.networks.actor, self.worlds, noise)
         self.replay.extend(batch)
 
     def _learn(self) -> dict[str, Tensor]:
