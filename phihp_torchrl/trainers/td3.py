@@ -13,14 +13,13 @@ from torch import Tensor
 from phihp_torchrl.agents import (
     Batch,
     FlatReplay,
+    Imagination,
     TD3Config,
     TD3Update,
     Worlds,
     copy_actor,
     copy_twin_qvalue,
     draw_noise,
-    imagine,
-    imagined_return,
     learning_rate_scale,
     make_td3_loss,
 )
@@ -135,17 +134,18 @@ class RealTD3Trainer:
     ) -> None:
         self.task = task
         self.config = config
-        self.world = TaskWorldModel(task, HybridDynamics.oracle(task))
+        world = TaskWorldModel(task, HybridDynamics.oracle(task))
         self.generator = torch.Generator().manual_seed(seed)
-        self.loss = make_td3_loss(self.world, config)
-        self.update = TD3Update(self.loss, self.world, config, compile=compile)
+        self.loss = make_td3_loss(world, config)
+        self.update = TD3Update(self.loss, world, config, compile=compile)
+        # What imagined worlds are stepped with; this one is no imagination, it is the true one.
+        self.world = Imagination(world, self.loss.max_action, task.max_steps, compile=compile)
         given = 0 if transitions is None else len(transitions.reward)
         capacity = min(config.replay_capacity, given + config.real_steps)
         self.replay = FlatReplay(capacity, task.system.state_dim, task.system.action_dim)
         if transitions is not None:
             self.replay.extend(transitions)
         self.given = given
-        self._step_world = torch.compile(imagine, fullgraph=True) if compile else imagine
         first = task.reset.sample([1], generator=self.generator)
         self.worlds = Worlds(first, torch.zeros(1, dtype=torch.int64))
         self.updates = 0
@@ -193,13 +193,8 @@ class RealTD3Trainer:
 
     def evaluate(self) -> Tensor:
         """Returns ``[evaluation_episodes]`` of the noise-free actor in the real world."""
-        return imagined_return(
-            self.world,
-            self.update.actor,
-            self._evaluation_states,
-            self.loss.max_action,
-            self.task.max_steps,
-        )
+        states, steps = self._evaluation_states, self.task.max_steps
+        return self.world.returns(self.update.networks.actor, states, steps).total
 
     def parts(self) -> dict[str, Any]:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""
@@ -238,14 +233,7 @@ class RealTD3Trainer:
             random_fraction=0.0 if warm else 1.0,
             generator=self.generator,
         )
-        batch, self.worlds = self._step_world(
-            self.world,
-            self.update.actor,
-            self.worlds,
-            noise,
-            self.loss.max_action,
-            self.task.max_steps,
-        )
+        batch, self.worlds = self.world.chunk(self.update.networks.actor, self.worlds, noise)
         self.replay.extend(batch)
 
     def _learn(self) -> dict[str, Tensor]:
