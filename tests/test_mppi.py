@@ -106,8 +106,8 @@ def test_elite_weights_by_hand():
     assert elite_weights(torch.tensor([[3.0], [1.0]]), 0.0).tolist() == [[0.5], [0.5]]
 
 
-def one_step(momentum=0.0, min_std=0.0, select="mean", choice=(0.5, 0.5), mean=None):
-    """Candidates 0.3, -0.1 and 0.9 around zero, of which the first two are the elites."""
+def one_step(momentum=0.0, min_std=0.0, select="mean", choice=((0.5,), (0.5,)), mean=0.0):
+    """Candidates 0.3, -0.1 and 0.9 around ``mean``, of which the first two are the elites."""
     s = settings(
         planning_horizon=1,
         optim_steps=1,
@@ -118,9 +118,13 @@ def one_step(momentum=0.0, min_std=0.0, select="mean", choice=(0.5, 0.5), mean=N
         temperature=2.0,
         select=select,
     )
-    samples = torch.tensor([0.3, -0.1, 0.9], dtype=torch.float64).reshape(1, 1, 3, 1)
-    noise = MPPINoise(samples, samples[0, :, :0], torch.tensor(choice, dtype=torch.float64))
-    state = torch.zeros(1, dtype=torch.float64)
+    choice = torch.tensor(choice, dtype=torch.float64)
+    rows = choice.shape[1]
+    samples = torch.tensor([0.3, -0.1, 0.9], dtype=torch.float64).reshape(1, 1, 3, 1, 1)
+    samples = samples.expand(-1, -1, -1, rows, -1)
+    noise = MPPINoise(samples, samples[0, :, :0], choice)
+    state = torch.zeros(rows, 1, dtype=torch.float64)
+    mean = torch.full((rows, 1, 1), mean, dtype=torch.float64)
     return plan(state, noise, s, mean, low=(-1.0,), high=(1.0,))
 
 
@@ -139,18 +143,17 @@ def test_refit_by_hand():
 
 
 def test_momentum_and_the_limits_of_the_std_by_hand():
-    mean = torch.full((1, 1), 0.0, dtype=torch.float64)
-    found = one_step(momentum=0.25, min_std=0.5, mean=mean)
+    found = one_step(momentum=0.25, min_std=0.5)
     torch.testing.assert_close(found.mean.item(), 0.75 * MEAN)
     assert found.std.item() == 0.5
     # Around 0.2 the three candidates are 0.5, 0.1 and 1 (clipped): 0.5 and 0.1 score the same.
-    shifted = one_step(mean=mean + 0.2, momentum=0.5)
+    shifted = one_step(mean=0.2, momentum=0.5)
     torch.testing.assert_close(shifted.mean.item(), 0.5 * 0.2 + 0.5 * 0.3)
 
 
 def test_the_elite_to_act_with_is_drawn_by_its_weight():
-    draws = torch.rand(4000, 2, generator=torch.Generator().manual_seed(0))
-    actions = [one_step(select="sample", choice=c).actions.item() for c in draws.tolist()]
+    draws = torch.rand(2, 4000, generator=torch.Generator().manual_seed(0))
+    actions = one_step(select="sample", choice=draws.tolist()).actions.flatten().tolist()
     share = sum(action == 0.3 for action in actions) / len(actions)
     assert set(actions) == {0.3, -0.1}
     assert abs(share - W) < 4 * sqrt(W * (1 - W) / len(actions))

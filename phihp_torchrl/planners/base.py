@@ -36,25 +36,33 @@ _logger = logging.getLogger(__name__)
 class SamplingPlanner(MPCPlannerBase):
     """A planner that scores sampled sequences in a model: all but the plan itself.
 
-    :class:`~phihp_torchrl.CEMPlanner` and :class:`~phihp_torchrl.planners.MPPIPlanner` are such,
-    and document the arguments.
+    :class:`~phihp_torchrl.CEMPlanner` and :class:`~phihp_torchrl.planners.MPPIPlanner` are such.
 
     Args:
-        env: the model to plan on.
+        env: the model to plan on, an environment of batch size ``[]``.
         settings: the numbers of the search.
         plan: the plan as a pure function, with ``problem`` and ``settings`` among its keywords.
         memory: what carries over from one step to the next, or ``None``.
         reward_key: where a step leaves the reward.
         action_key: the action.
-        actor: the policy, or ``None``.
-        qvalue: the critics, or ``None``.
-        observation_key: what the tensor model is given.
-        done_keys: after which flags of a step nothing counts any more.
+        actor: a module that writes ``action_key``, in physical units, or ``None``.
+        qvalue: a module that reads what the actor reads and the action, and writes ``value_key``;
+            of several values the smallest counts. Needs an actor.
+        observation_key: what the tensor model is given. Defaults to ``"observation"``, or the only
+            observation there is.
+        done_keys: after which flags of a step nothing counts any more. Defaults to all of the
+            environment's that end in ``"terminated"``.
         value_key: what ``qvalue`` writes.
-        is_init_key: true where an episode starts.
-        backend: ``"tensor"``, ``"env"`` or ``"auto"``.
-        compile: whether to compile the plan.
-        generator: source of the noise.
+        is_init_key: bool that is true where an episode starts (see
+            :class:`torchrl.envs.InitTracker`); without it, call :meth:`reset`.
+        backend: ``"tensor"``, ``"env"``, or ``"auto"`` for the first where it can be.
+        compile: whether to compile the plan as one full graph; a dict is passed to
+            :func:`torch.compile`. Left out where the environment is stepped or does not compile.
+        generator: source of the noise, on the environment's device. Defaults to torch's global one.
+
+    Raises:
+        ValueError: for an argument out of range or a key that is not there; when planning, for an
+            observation that is missing, not finite, or of the wrong shape, dtype or device.
     """
 
     def __init__(
@@ -63,18 +71,18 @@ class SamplingPlanner(MPCPlannerBase):
         settings: SearchSettings,
         plan: Callable[..., Any],
         memory: PlanMemory | None,
-        reward_key: NestedKey,
-        action_key: NestedKey,
+        reward_key: NestedKey = ("next", "reward"),
+        action_key: NestedKey = "action",
         *,
-        actor: TensorDictModuleBase | None,
-        qvalue: TensorDictModuleBase | None,
-        observation_key: NestedKey | None,
-        done_keys: NestedKey | Sequence[NestedKey] | None,
-        value_key: NestedKey,
-        is_init_key: NestedKey,
-        backend: str,
-        compile: bool | dict[str, Any],
-        generator: torch.Generator | None,
+        actor: TensorDictModuleBase | None = None,
+        qvalue: TensorDictModuleBase | None = None,
+        observation_key: NestedKey | None = None,
+        done_keys: NestedKey | Sequence[NestedKey] | None = None,
+        value_key: NestedKey = "state_action_value",
+        is_init_key: NestedKey = "is_init",
+        backend: str = "auto",
+        compile: bool | dict[str, Any] = False,
+        generator: torch.Generator | None = None,
     ) -> None:
         action_key, reward_key = unravel_key(action_key), unravel_key(reward_key)
         action_spec = find_action(env, action_key)

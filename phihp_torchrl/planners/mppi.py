@@ -7,8 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -37,20 +36,8 @@ class MPPIPlanner(SamplingPlanner):
     Args:
         env: the model to plan on, an environment of batch size ``[]``.
         settings: the numbers; :attr:`settings` may be assigned anew, as schedules do.
-        reward_key: where a step leaves the reward.
-        action_key: the action.
-        actor: a module that writes ``action_key``, in physical units.
-        qvalue: a module that reads what the actor reads and the action, and writes ``value_key``;
-            of several values the smallest counts. Needs an actor.
-        observation_key: what the tensor model is given (see :class:`~phihp_torchrl.CEMPlanner`).
-        done_keys: after which flags of a step nothing counts any more. Defaults to all of the
-            environment's that end in ``"terminated"``.
-        value_key: what ``qvalue`` writes.
-        is_init_key: bool that is true where an episode starts (see
-            :class:`torchrl.envs.InitTracker`); without it, call :meth:`reset`.
-        backend: ``"tensor"``, ``"env"``, or ``"auto"`` for the first where it can be.
-        compile: whether to compile the plan as one full graph; each horizon is another graph.
-        generator: source of the noise, on the environment's device. Defaults to torch's global one.
+        options: ``actor``, ``qvalue``, keys, ``backend``, ``compile`` and ``generator`` of
+            :class:`~phihp_torchrl.planners.base.SamplingPlanner`. Each horizon compiles anew.
 
     Raises:
         ValueError: for an argument out of range or a key that is not there; when planning, for an
@@ -72,40 +59,9 @@ class MPPIPlanner(SamplingPlanner):
     settings: MPPISettings
     memory: PlanMemory
 
-    def __init__(
-        self,
-        env: EnvBase,
-        settings: MPPISettings,
-        reward_key: NestedKey = ("next", "reward"),
-        action_key: NestedKey = "action",
-        *,
-        actor: TensorDictModuleBase | None = None,
-        qvalue: TensorDictModuleBase | None = None,
-        observation_key: NestedKey | None = None,
-        done_keys: NestedKey | Sequence[NestedKey] | None = None,
-        value_key: NestedKey = "state_action_value",
-        is_init_key: NestedKey = "is_init",
-        backend: str = "auto",
-        compile: bool | dict[str, Any] = False,
-        generator: torch.Generator | None = None,
-    ) -> None:
-        super().__init__(
-            env,
-            settings,
-            mppi_plan,
-            PlanMemory(replan_every=1, warm_start=True),
-            reward_key,
-            action_key,
-            actor=actor,
-            qvalue=qvalue,
-            observation_key=observation_key,
-            done_keys=done_keys,
-            value_key=value_key,
-            is_init_key=is_init_key,
-            backend=backend,
-            compile=compile,
-            generator=generator,
-        )
+    def __init__(self, env: EnvBase, settings: MPPISettings, **options: Any) -> None:
+        memory = PlanMemory(replan_every=1, warm_start=True)
+        super().__init__(env, settings, mppi_plan, memory, **options)
         self._built_in: MPPISettings | None = None
 
     def draw_noise(self, batch: Sequence[int]) -> MPPINoise:
