@@ -20,11 +20,16 @@ from tensordict import TensorDict
 
 from phihp_torchrl import HybridDynamics, Task, get_task
 from phihp_torchrl.dynamics import DynamicsLoss, PhysicsPrior, fit, split
-from phihp_torchrl.evaluation import PUBLISHED_SAMPLES, evaluation_seed, markdown_table
+from phihp_torchrl.evaluation import (
+    PREDICTION_EPISODES,
+    PREDICTION_STEPS,
+    PUBLISHED_SAMPLES,
+    markdown_table,
+    prediction_errors,
+)
 from phihp_torchrl.trainers import ModelConfig, ModelTrainer, make_dynamics, read_request
 
 RESULTS = Path("results/model_error")
-STEPS, EPISODES = 20, 200
 
 
 def model_config(task: str) -> ModelConfig:
@@ -34,32 +39,6 @@ def model_config(task: str) -> ModelConfig:
         str(Path(__file__).parent.absolute() / "config"), version_base="1.3"
     ):
         return read_request(compose("phihp", overrides), overrides).config.model
-
-
-def unseen_episodes(task: Task, where: str) -> tuple[torch.Tensor, ...]:
-    """Start states, held random actions and true final states of short real episodes."""
-    generator = torch.Generator().manual_seed(evaluation_seed(0))
-    box = task.coverage if where == "coverage" else task.reset
-    start = state = box.sample([EPISODES], generator=generator)
-    high = torch.tensor(task.action_high)
-    shape = (EPISODES, STEPS // 5, len(high))
-    actions = high * (2 * torch.rand(shape, generator=generator) - 1)
-    actions = actions.repeat_interleave(5, dim=1)
-    for action in actions.unbind(1):
-        state = task.step(state, action)
-    return start, actions, state
-
-
-def rollout_errors(task: Task, dynamics: HybridDynamics) -> dict[str, float]:
-    """Mean and median distance after the last step, raw units, angles on the circle."""
-    errors = {}
-    for where in ("reset", "coverage"):
-        start, actions, end = unseen_episodes(task, where)
-        predicted = dynamics.rollout(start, actions)[:, -1]
-        distance = task.system.difference(end, predicted).norm(dim=-1)
-        errors[f"{where}_mean"] = distance.mean().item()
-        errors[f"{where}_median"] = distance.median().item()
-    return errors
 
 
 def compare(name: str, seed: int) -> dict[str, object]:
@@ -84,8 +63,8 @@ def compare(name: str, seed: int) -> dict[str, object]:
         "task": name,
         "seed": seed,
         "real_steps": trainer.real_steps,
-        "hybrid": rollout_errors(task, trainer.dynamics),
-        "data_driven": rollout_errors(task, fit_data_driven(task, config, trainer.data, seed)),
+        "hybrid": prediction_errors(task, trainer.dynamics),
+        "data_driven": prediction_errors(task, fit_data_driven(task, config, trainer.data, seed)),
         "constants": constants,
     }
 
@@ -124,7 +103,7 @@ def write_tables() -> None:
     text = (
         "# Held-out prediction\n\n"
         "Made by `python recipes/model_error.py`: distance between true and predicted state after "
-        f"{STEPS} steps, over {EPISODES} episodes from evaluation seeds.\n\n"
+        f"{PREDICTION_STEPS} steps, over {PREDICTION_EPISODES} episodes from evaluation seeds.\n\n"
         f"{markdown_table(error_header, errors)}\n"
         "# Identified constants\n\n"
         "Each constant's first guess is 30 % off; the combinations that the motion determines:\n\n"

@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.evaluation.curve import (
+    CurvePoint,
+    curve_from_metrics,
+    read_curve,
+    write_curve,
+)
 from phihp_torchrl.evaluation.episode import Episode, play_episode
 from phihp_torchrl.evaluation.figures import episode_figure, learning_curve
 from phihp_torchrl.evaluation.latency import Latency, measure_latency
+from phihp_torchrl.evaluation.prediction import (
+    PREDICTION_EPISODES,
+    PREDICTION_STEPS,
+    UnseenEpisodes,
+    prediction_errors,
+    unseen_episodes,
+)
 from phihp_torchrl.evaluation.published import PUBLISHED, PUBLISHED_SAMPLES, TARGETS, Published
 from phihp_torchrl.evaluation.returns import (
     Evaluation,
@@ -18,16 +31,21 @@ from phihp_torchrl.evaluation.video import write_gif
 
 __all__ = [
     "EVALUATION_SEED",
+    "PREDICTION_EPISODES",
+    "PREDICTION_STEPS",
     "PUBLISHED",
     "PUBLISHED_SAMPLES",
     "TARGETS",
+    "CurvePoint",
     "Episode",
     "Evaluation",
     "Latency",
     "PairedDifference",
     "Published",
     "TaskResult",
+    "UnseenEpisodes",
     "check_training_seed",
+    "curve_from_metrics",
     "episode_figure",
     "evaluate",
     "evaluation_seed",
@@ -37,6 +55,10 @@ __all__ = [
     "measure_latency",
     "paired_difference",
     "play_episode",
+    "prediction_errors",
+    "read_curve",
     "returns_table",
+    "unseen_episodes",
+    "write_curve",
     "write_gif",
 ]
