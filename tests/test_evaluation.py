@@ -19,11 +19,14 @@ from phihp_torchrl.deployment import Agent
 from phihp_torchrl.envs import make_task_env
 from phihp_torchrl.evaluation import (
     EVALUATION_SEED,
+    PREDICTION_EPISODES,
+    PREDICTION_STEPS,
     PUBLISHED,
     PUBLISHED_SAMPLES,
     TARGETS,
     TaskResult,
     check_training_seed,
+    curve_from_metrics,
     episode_figure,
     evaluate,
     evaluation_seed,
@@ -33,7 +36,11 @@ from phihp_torchrl.evaluation import (
     measure_latency,
     paired_difference,
     play_episode,
+    prediction_errors,
+    read_curve,
     returns_table,
+    unseen_episodes,
+    write_curve,
     write_gif,
 )
 from phihp_torchrl.planners.factory import PlannerConfig
@@ -395,3 +402,45 @@ def test_tables():
         ["cartpole-swingup", "2", "500", "–", "405.0 ± 7.1", "420", "–", "–"],
     ]
     assert mean_and_std([-1.25, -1.75], 2) == "−1.50 ± 0.35"
+
+
+def test_a_curve_is_every_evaluation_in_the_real_world(tmp_path):
+    row = {"phase": "policy", "real_steps": "60", "seconds": "1.5"}
+    rows = [
+        {**row, "phase": "model", "collect/reward": "-1"},
+        {**row, "policy/updates": "10", "policy/imagined_steps": "640", "policy/real_return": "-9"},
+        {**row, "policy/updates": "20", "policy/real_return": "-inf"},
+        {**row, "td3/updates": "30", "return_mean": "-8", "return_std": "2", "loss": ""},
+        {**row, "tdmpc/planner_return": "-7", "tdmpc/actor_return": "-6", "tdmpc/episode_return": "0"},
+        {**row, "evaluate/planner/return_mean": "-5", "evaluate/planner/return_std": "1",
+         "evaluate/planner/episodes": "50", "evaluate/actor/return_mean": ""},
+    ]  # fmt: skip
+    curve = curve_from_metrics(rows)
+    assert [(p.acting, p.return_mean, p.updates) for p in curve[1:]] == [
+        ("actor", -8, 30),
+        ("planner", -7, 30),
+        ("actor", -6, 30),
+        ("planner", -5, 30),
+    ]
+    assert (curve[0].return_mean, curve[0].updates, curve[0].imagined_steps) == (-9, 10, 640)
+    assert (curve[1].return_std, curve[4].return_std, curve[4].episodes) == (2, 1, 50)
+    assert math.isnan(curve[2].return_std)
+    write_curve(tmp_path / "curve.csv", curve)
+    assert str(read_curve(tmp_path / "curve.csv")) == str(curve)  # NaN is not NaN
+    (tmp_path / "curve.csv").write_text("real_steps,return_mean\n1,2\n")
+    with pytest.raises(ValueError, match=r"curve\.csv: expected the columns"):
+        read_curve(tmp_path / "curve.csv")
+
+
+def test_predictions_are_judged_on_states_of_their_own():
+    task = get_task("acrobot")
+    start, actions, end = unseen_episodes(task, "coverage")
+    assert start.shape == end.shape == (PREDICTION_EPISODES, 4)
+    assert actions.shape == (PREDICTION_EPISODES, PREDICTION_STEPS, 1)
+    assert torch.equal(start, unseen_episodes(task, "coverage").start)
+    right = prediction_errors(task, HybridDynamics.oracle(task))
+    wrong = prediction_errors(task, HybridDynamics.hybrid(task))
+    assert right["reset_mean"] < 1e-4 < wrong["reset_mean"]
+    assert right["coverage_median"] < 1e-2 < wrong["coverage_median"]
+    with pytest.raises(ValueError, match="where: expected a box"):
+        unseen_episodes(task, "nowhere")

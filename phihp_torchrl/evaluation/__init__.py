@@ -9,7 +9,7 @@ from phihp_torchrl.evaluation.curve import (
     write_curve,
 )
 from phihp_torchrl.evaluation.episode import Episode, play_episode
-from phihp_torchrl.evaluation.figures import episode_figure, learning_curve
+from phihp_torchrl.evaluation.figures import draw_learning_curves, episode_figure, learning_curve
 from phihp_torchrl.evaluation.latency import Latency, measure_latency
 from phihp_torchrl.evaluation.prediction import (
     PREDICTION_EPISODES,
@@ -46,6 +46,7 @@ __all__ = [
     "UnseenEpisodes",
     "check_training_seed",
     "curve_from_metrics",
+    "draw_learning_curves",
     "episode_figure",
     "evaluate",
     "evaluation_seed",

@@ -8,8 +8,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+# Metrics of returns in the real world, and who earned them: first during training, then at the end.
+_TRAINING = {
+    "return_mean": "actor",
+    "real_return": "actor",
+    "actor_return": "actor",
+    "planner_return": "planner",
+}
 _FINAL = ("evaluate/", "/return_mean")
-_REAL_RETURN = "/real_return"
 
 
 @dataclass(frozen=True)
@@ -42,8 +48,9 @@ class CurvePoint:
 def curve_from_metrics(rows: Iterable[Mapping[str, str]]) -> list[CurvePoint]:
     """The curve in the rows of a run's ``metrics.csv``.
 
-    Points are the evaluations of the actor during training (``*/real_return``) and those of the
-    last phase (``evaluate/*/return_mean``). What is not a finite number is left out.
+    Points are the evaluations during training, whatever the phase is called (``return_mean``,
+    ``*/real_return``, ``*/actor_return``, ``*/planner_return``), and those of the last phase
+    (``evaluate/*/return_mean``). What is not a finite number is left out.
 
     Examples:
         >>> row = {"phase": "policy", "real_steps": "500", "seconds": "7", "policy/updates": "10"}
@@ -53,7 +60,7 @@ def curve_from_metrics(rows: Iterable[Mapping[str, str]]) -> list[CurvePoint]:
     points = []
     updates = imagined = math.nan
     for row in rows:
-        updates = _number(row, "policy/updates", updates)
+        updates = next((_number(row, k) for k in row if k.endswith("/updates") and row[k]), updates)
         imagined = _number(row, "policy/imagined_steps", imagined)
         for acting, name in _returns(row):
             mean = _number(row, name)
@@ -64,7 +71,7 @@ def curve_from_metrics(rows: Iterable[Mapping[str, str]]) -> list[CurvePoint]:
                     seconds=float(row["seconds"]),
                     acting=acting,
                     return_mean=mean,
-                    return_std=_number(row, name.replace("_mean", "") + "_std"),
+                    return_std=_number(row, name.removesuffix("_mean") + "_std"),
                     episodes=_number(row, name.rpartition("/")[0] + "/episodes"),
                     updates=updates,
                     imagined_steps=imagined,
@@ -115,10 +122,10 @@ def _returns(row: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     for name, value in row.items():
         if not value:
             continue
-        if name.endswith(_REAL_RETURN):
-            yield "actor", name
-        elif name.startswith(start) and name.endswith(end):
+        if name.startswith(start) and name.endswith(end):
             yield name.removeprefix(start).removesuffix(end), name
+        elif not name.startswith(start) and (acting := _TRAINING.get(name.rpartition("/")[2])):
+            yield acting, name
 
 
 def _number(row: Mapping[str, str], name: str, default: float = math.nan) -> float:

@@ -69,6 +69,17 @@ def learning_curve(
     """
     figure = Figure(figsize=(6.0, 4.0), layout="constrained")
     axis = figure.subplots()
+    draw_learning_curves(axis, curves, reference)
+    axis.set(xlabel=xlabel, ylabel="return", title=title)
+    return figure
+
+
+def draw_learning_curves(
+    axis: Axes,
+    curves: Mapping[str, Sequence[tuple[ArrayLike, ArrayLike]]],
+    reference: Mapping[str, float] | None = None,
+) -> None:
+    """What :func:`learning_curve` draws, on an axis of a larger figure; a lone point is a dot."""
     largest, smallest = 0.0, math.inf
     for i, (method, seeds) in enumerate(curves.items()):
         color = f"C{i % 10}"
@@ -77,6 +88,7 @@ def learning_curve(
         for x, y in runs:
             one = len(runs) == 1
             axis.plot(x, y, color=color, linewidth=2 if one else 0.7, alpha=1 if one else 0.5,
+                      marker="o" if len(x) == 1 else None, markersize=4,
                       label=method if one else None)  # fmt: skip
             largest = max(largest, float(x.max()))
             smallest = min(smallest, *(float(v) for v in x[x > 0]), math.inf)
@@ -86,16 +98,15 @@ def learning_curve(
             low, high = max(x[0] for x, _ in runs), min(x[-1] for x, _ in runs)
             grid = grid[(grid >= low) & (grid <= high)]
             mean = np.mean([np.interp(grid, x, y) for x, y in runs], axis=0)
-            axis.plot(grid, mean, color=color, linewidth=2, label=f"{method} ({len(runs)} seeds)")
+            axis.plot(grid, mean, color=color, linewidth=2, marker="D" if len(grid) == 1 else None,
+                      label=f"{method} ({len(runs)} seeds)")  # fmt: skip
     for name, level in (reference or {}).items():
         axis.axhline(level, color="0.4", linestyle="--", linewidth=1, label=name)
     if largest > 50 * smallest:
         axis.set_xscale("symlog", linthresh=smallest)
-    axis.set(xlabel=xlabel, ylabel="return", title=title)
     axis.grid(alpha=0.3)
     if curves or reference:
         axis.legend(fontsize="small")
-    return figure
 
 
 def _with_gaps(angle: np.ndarray) -> np.ndarray:

@@ -1,0 +1,71 @@
+"""The paper's main table: return, sample efficiency and time of an action, beside the published."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from phihp_torchrl.evaluation import PUBLISHED, Published
+from phihp_torchrl.report.efficiency import sample_efficiency
+from phihp_torchrl.report.parts import Cell, Section, Stat, Table
+from phihp_torchrl.report.results import TASKS, Results
+from phihp_torchrl.report.systems import BASELINES, PHIHP, System
+
+_COLUMNS = (PHIHP, *BASELINES)
+
+
+def main_table(results: Results) -> Section:
+    """A table for each of the three metrics."""
+
+    def returns(system: System, task: str) -> Stat:
+        return Stat(tuple(score.mean for score in results.best_fed(system, task)))
+
+    def samples(system: System, task: str) -> Stat:
+        return Stat(sample_efficiency(results, system, task), 0)
+
+    def milliseconds(system: System, task: str) -> Stat:
+        times = (score.milliseconds for score in results.best_fed(system, task))
+        return Stat(tuple(time for time in times if time is not None), 2)
+
+    return Section(
+        "Main table",
+        "Mean ± std over seeds (number of seeds); under *published*, the paper's numbers, mean ± "
+        "std over 10 runs, times on an Apple M1. The paper's CartPoleSwingup is "
+        "`cartpole-swingup-published`. Returns and times are those of the runs with the most real "
+        "samples.",
+        {
+            "Return": _table("main_return", returns, _published_return),
+            "Real samples to 90 % of the best return": _table(
+                "main_samples", samples, _published_samples
+            ),
+            "Milliseconds for an action, median": _table(
+                "main_milliseconds", milliseconds, _published_milliseconds
+            ),
+        },
+    )
+
+
+def _table(
+    name: str, ours: Callable[[System, str], Cell], theirs: Callable[[Published], str]
+) -> Table:
+    header, rows = ["task"], []
+    for system in _COLUMNS:
+        header += [system.name, f"{system.name}, published"]
+    for task in TASKS:
+        row: list[Cell] = [task]
+        for system in _COLUMNS:
+            published = PUBLISHED.get(task, {}).get(system.name)
+            row += [ours(system, task), "–" if published is None else theirs(published)]
+        rows.append(row)
+    return Table(name, header, rows)
+
+
+def _published_return(published: Published) -> str:
+    return f"{published.return_mean:.0f} ± {published.return_std:.0f}".replace("-", "−")
+
+
+def _published_samples(published: Published) -> str:
+    return "none" if published.samples is None else f"{1000 * published.samples:.0f}"
+
+
+def _published_milliseconds(published: Published) -> str:
+    return f"{published.milliseconds:g}"

@@ -1,0 +1,117 @@
+"""A report from folders of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from phihp_torchrl.report.ablation import ablation
+from phihp_torchrl.report.acting import acting_section
+from phihp_torchrl.report.aggregate import aggregate_section
+from phihp_torchrl.report.claims import claims_section
+from phihp_torchrl.report.curves import imagined_curves, learning_curves
+from phihp_torchrl.report.generalization import generalization
+from phihp_torchrl.report.main_table import main_table
+from phihp_torchrl.report.overview import fill_page, origins, overview
+from phihp_torchrl.report.parts import Section
+from phihp_torchrl.report.results import Results
+from phihp_torchrl.report.runs import read_runs
+from phihp_torchrl.report.sensitivity import read_trials, sensitivity
+from phihp_torchrl.report.significance import significance
+from phihp_torchrl.report.write import write_report
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """Where a report comes from and goes; ``recipes/config/report.yaml`` mirrors it.
+
+    Args:
+        runs: directory with a folder for each run.
+        sensitivity: directory of ``recipes/sensitivity.py``'s data.
+        out: directory of the report.
+        label: the settings whose runs it is on.
+        any_version: whether to take runs of other versions of this package.
+        reps: resamples of the bootstrap.
+        overview: page with PhIHP's tables for every label; ``None`` for none.
+        page: page with the table of returns between its markers; ``None`` for none.
+    """
+
+    runs: str = "results/runs"
+    sensitivity: str = "results/sensitivity"
+    out: str = "results/report"
+    label: str = "default"
+    any_version: bool = False
+    reps: int = 2000
+    overview: str | None = "results/README.md"
+    page: str | None = "README.md"
+
+    def __post_init__(self) -> None:
+        if self.reps < 1:
+            raise ValueError(f"reps: expected a positive number, got {self.reps}.")
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report that was made.
+
+    Args:
+        sections: its parts.
+        problems: a sentence for each folder that was left out, and each part that could not be
+            made.
+    """
+
+    sections: tuple[Section, ...]
+    problems: tuple[str, ...]
+
+
+def make_report(config: ReportConfig) -> Report:
+    """Make all of a report that can be made, and write it.
+
+    Args:
+        config: from where and to where.
+    """
+    folders = read_runs(Path(config.runs), any_version=config.any_version)
+    trials, unread = read_trials(Path(config.sensitivity))
+    problems = [*folders.problems, *unread]
+    chosen = [run for run in folders.runs if run.label == config.label]
+    results = Results(chosen)
+    sections = [
+        _make("The paper's claims", lambda: claims_section(results), problems),
+        _make("Main table", lambda: main_table(results), problems),
+        _make("Learning curves", lambda: learning_curves(results), problems),
+        _make("Performance over runs", lambda: aggregate_section(results, config.reps), problems),
+        _make("Welch's t-tests", lambda: significance(results), problems),
+        _make("Ablation", lambda: ablation(results), problems),
+        _make("Generalization", lambda: generalization(results), problems),
+        _make("TD3 in imagination", lambda: imagined_curves(results), problems),
+        _make("Sensitivity", lambda: sensitivity(trials), problems),
+        _make("PhIHP, planner and actor", lambda: acting_section(chosen), problems),
+    ]
+    if problems:
+        sections.append(_left_out(problems))
+    introduction = (
+        f"Made by `python recipes/report.py` from `{config.runs}`, label `{config.label}`. Do not "
+        "edit. `docs/evaluation.md` defines each metric. "
+        + (origins(chosen) if chosen else "There are no runs with that label.")
+    )
+    write_report(Path(config.out), "Report", introduction, sections)
+    if config.overview is not None:
+        Path(config.overview).parent.mkdir(parents=True, exist_ok=True)
+        Path(config.overview).write_text(overview(folders.runs))
+    if config.page is not None and chosen:
+        fill_page(Path(config.page), chosen)
+    return Report(tuple(sections), tuple(problems))
+
+
+def _make(title: str, make: Callable[[], Section], problems: list[str]) -> Section:
+    """A section, or a word on why it could not be made."""
+    try:
+        return make()
+    except ImportError as error:  # of the extra `report`
+        problems.append(f"{title}: not made: {error}")
+        return Section(title, f"Not made: {error}")
+
+
+def _left_out(problems: Sequence[str]) -> Section:
+    return Section("Left out", "\n".join(f"- {problem}" for problem in problems))

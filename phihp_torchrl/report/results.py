@@ -1,0 +1,83 @@
+"""The scores of each system on each task, out of all runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from phihp_torchrl.evaluation import PUBLISHED_SAMPLES, TARGETS
+from phihp_torchrl.report.bounds import normalise
+from phihp_torchrl.report.runs import Acting, Run
+from phihp_torchrl.report.systems import System
+
+TASKS = tuple(PUBLISHED_SAMPLES)
+"""The tasks in the paper's order, the published variant of CartPoleSwingup among them."""
+
+SIX_TASKS = tuple(TARGETS)
+"""The six tasks that averages are over."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a system earned in one run.
+
+    Args:
+        run: the run.
+        acting: how it acted: ``"planner"`` or ``"actor"``.
+    """
+
+    run: Run
+    acting: str
+
+    @property
+    def result(self) -> Acting:
+        """Its episodes and latency."""
+        return self.run.acting[self.acting]
+
+    @property
+    def mean(self) -> float:
+        """Mean return over its episodes."""
+        return self.result.mean
+
+    @property
+    def normalised(self) -> float:
+        """Mean return from 0 to 1."""
+        return normalise(self.run.task, self.mean)
+
+    @property
+    def milliseconds(self) -> float | None:
+        """Median time of an action, if it was measured."""
+        return self.result.latency.get("p50")
+
+
+class Results:
+    """Scores by system and task.
+
+    Args:
+        runs: all runs with one label.
+    """
+
+    def __init__(self, runs: Iterable[Run]) -> None:
+        self.runs = tuple(runs)
+
+    def scores(self, system: System, task: str) -> list[Score]:
+        """All scores of a system on a task, one for each seed and number of samples."""
+        found: dict[tuple[int, int], Score] = {}
+        for method, wanted in system.sources:
+            for run in self.runs:
+                if (run.method, run.task) != (method, task):
+                    continue
+                acting = wanted or next(iter(run.acting))
+                if acting in run.acting:
+                    found.setdefault((run.samples, run.seed), Score(run, acting))
+        return [found[key] for key in sorted(found)]
+
+    def best_fed(self, system: System, task: str) -> list[Score]:
+        """The scores with the most real samples that the system was run with, by seed."""
+        scores = self.scores(system, task)
+        most = max((score.run.samples for score in scores), default=0)
+        return [score for score in scores if score.run.samples == most]
+
+    def has_run(self, system: System, task: str) -> bool:
+        """Whether there is a score."""
+        return bool(self.scores(system, task))
