@@ -411,7 +411,8 @@ def test_a_curve_is_every_evaluation_in_the_real_world(tmp_path):
         {**row, "policy/updates": "10", "policy/imagined_steps": "640", "policy/real_return": "-9"},
         {**row, "policy/updates": "20", "policy/real_return": "-inf"},
         {**row, "td3/updates": "30", "return_mean": "-8", "return_std": "2", "loss": ""},
-        {**row, "tdmpc/planner_return": "-7", "tdmpc/actor_return": "-6", "tdmpc/episode_return": "0"},
+        {**row, "tdmpc/planner_return": "-7", "tdmpc/actor_return": "-6",
+         "tdmpc/episode_return": "0"},
         {**row, "evaluate/planner/return_mean": "-5", "evaluate/planner/return_std": "1",
          "evaluate/planner/episodes": "50", "evaluate/actor/return_mean": ""},
     ]  # fmt: skip
