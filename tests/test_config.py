@@ -151,6 +151,7 @@ def composed():
         ("policy.updatez=3", "policy.updatez"),
         ("task=nonsense", "task/nonsense"),
         ("preset=nonsense", "preset/nonsense"),
+        ("method=nonsense", "method/nonsense"),
         ("logger=nonsense", "logger/nonsense"),
         ("resume=no_such_run", "no_such_run"),
         ("resume=3", "resume"),
