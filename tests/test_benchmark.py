@@ -34,6 +34,7 @@ from phihp_torchrl.benchmark import (
 )
 from phihp_torchrl.benchmark.grid import failures, summary, table
 from phihp_torchrl.evaluation import read_curve
+from phihp_torchrl.report import read_run
 from phihp_torchrl.trainers import ConfigError, from_mapping, read_request
 
 __all__ = ["recipe"]  # a fixture
@@ -100,6 +101,51 @@ def test_a_cell_is_run_once_and_what_is_small_is_kept(config: BenchmarkConfig) -
     assert do(config) == look(files)
     assert files.evaluation.stat().st_mtime_ns == before
     assert words(config) == ["started", "finished"]
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "acting", "samples", "points"),
+    [
+        (
+            "td3",
+            ("td3.real_steps=40", "td3.evaluation_interval=20", "td3.random_steps=20",
+             "td3.evaluation_episodes=2", "td3.actor_hidden_sizes=[8]",
+             "td3.critic_hidden_sizes=[8]"),
+            "actor", 40, 2,
+        ),
+        (
+            "dd-cem",
+            (*(s for s in TINY if s.startswith("model.")), "planner.planning_horizon=2",
+             "planner.num_candidates=8", "planner.top_k=2", "planner.replan_every=2"),
+            "planner", 60, 0,
+        ),
+        (
+            "cem-oracle",
+            ("planner.planning_horizon=2", "planner.num_candidates=8", "planner.top_k=2",
+             "planner.replan_every=2"),
+            "planner", 0, 0,
+        ),
+    ],
+)  # fmt: skip
+def test_other_methods_leave_what_a_report_reads(
+    config: BenchmarkConfig,
+    method: str,
+    settings: tuple[str, ...],
+    acting: str,
+    samples: int,
+    points: int,
+) -> None:
+    common = tuple(s for s in TINY if s.startswith(("compile", "evaluate")))
+    cell = replace(config, method=method, overrides=(*settings, *common))
+    state = do(cell)
+    assert state.status is Status.DONE, state
+    run = read_run(cell.files(Path()).kept)
+    assert (run.method, run.label, run.samples) == (method, "default", samples)
+    assert run.acting.keys() == {acting}
+    assert [point.acting for point in run.curve] == [acting] * (points + 1)
+    assert [point.real_steps for point in run.curve[:points]] == [20, 40][:points]
+    assert bool(run.prediction) == (method != "td3")
+    assert "p50" in run.acting[acting].latency
 
 
 def test_what_an_earlier_version_did_not_keep_is_added(config: BenchmarkConfig) -> None:
