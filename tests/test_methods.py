@@ -120,6 +120,24 @@ def test_the_settings_of_cem_oracle_are_the_papers() -> None:
         assert (plan.planning_horizon, plan.replan_every) == (30, 5)
 
 
+def test_the_settings_of_tdmpc_are_the_papers() -> None:
+    """The paper's table; 537 candidates are 512 at random and 25 of the policy."""
+    for task in TASKS:
+        ours = config(f"task={task}", recipe="tdmpc")
+        assert (ours.method, ours.preset) == ("td-mpc", "paper")
+        section, plan = ours.tdmpc, ours.tdmpc.planner
+        rate = 1e-4 if task in ("cartpole", "acrobot") else 1e-3
+        assert (section.learn.learning_rate, section.learn.critic_learning_rate) == (1e-3, rate)
+        assert (section.batch_size, section.learn.told.mlp_dim) == (512, 512)
+        assert (section.learn.tau, section.learn.target_interval) == (0.01, 2)
+        assert (section.seed_steps, section.replay_capacity) == (5000, 10**6)
+        assert (section.priority_alpha, section.priority_beta) == (0.6, 0.4)
+        assert (plan.num_candidates, plan.num_policy_candidates, plan.top_k) == (537, 25, 64)
+        assert (plan.optim_steps, plan.planning_horizon, section.horizon) == (6, 5, 5)
+        default = config(f"task={task}", "preset=default", recipe="tdmpc").tdmpc
+        assert default.learn.critic_learning_rate == rate
+
+
 def test_the_command_line_beats_the_method_and_the_method_the_task() -> None:
     ours = config("method=ph-cem", "task=acrobot", "planner.top_k=7")
     assert (ours.planner.top_k, ours.planner.num_candidates) == (7, 700)

@@ -132,6 +132,35 @@ def test_td3_then_resume_then_evaluate(
 
 
 @pytest.mark.slow
+def test_tdmpc_then_resume_then_evaluate(
+    recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = (
+        "preset=default",
+        "progress=false",
+        "compile=false",
+        "tdmpc.real_steps=60",
+        "tdmpc.seed_steps=20",
+        "tdmpc.batch_size=4",
+        "tdmpc.replay_capacity=200",
+        "tdmpc.evaluation_interval=30",
+        "tdmpc.evaluation_episodes=2",
+        "tdmpc.learn.told.mlp_dim=8",
+        "tdmpc.planner.num_candidates=16",
+        "evaluate.episodes=2",
+        "evaluate.latency_actions=3",
+        "evaluate.video=false",
+    )
+    recipe("tdmpc", "task=cartpole", "run_dir=run", *small)
+    assert "| cartpole | 1 | 60 |" in capsys.readouterr().out
+    recipe("tdmpc", "resume=run")
+    header = (tmp_path / "run" / "metrics.csv").read_text().splitlines()[0]
+    assert {"return_mean", "return_std", "tdmpc/td_error"} <= set(header.split(","))
+    recipe("evaluate", "agent=run/agent", "episodes=2", "latency_actions=3", "video=false")
+    assert "| cartpole | planner | actor |" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_cem_then_evaluate(
     recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

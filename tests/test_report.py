@@ -135,16 +135,36 @@ def text(made, title: str) -> str:
 
 
 def test_the_committed_runs_are_read_as_they_are() -> None:
-    folder = COMMITTED / "acrobot-swingup-default-n7500-seed1"
-    run = read_run(folder, any_version=True)
-    assert (run.method, run.task, run.label) == ("phihp", "acrobot-swingup", "default")
-    assert (run.samples, run.seed, run.kind) == (7500, 1, "hybrid")
-    assert run.acting.keys() == {"planner", "actor"}
-    stored = json.loads((folder / "evaluation.json").read_text())["planner"]
-    assert run.acting["planner"].mean == pytest.approx(stored["return_mean"])
-    assert run.acting["planner"].latency["p99"] == stored["latency_ms_p99"]
-    assert [point.acting for point in run.curve] == ["planner", "actor"]
-    assert run.prediction == {}
+    found = read_runs(COMMITTED, any_version=True)
+    assert found.problems == ()
+    assert len(found.runs) == len([path for path in COMMITTED.iterdir() if path.is_dir()])
+    for run in found.runs:
+        stored = json.loads((run.folder / "evaluation.json").read_text())
+        assert run.acting.keys() == stored.keys()
+        for way, part in stored.items():
+            assert run.acting[way].mean == pytest.approx(part["return_mean"])
+            assert run.acting[way].latency["p99"] == part["latency_ms_p99"]
+        assert run.folder.name.startswith(f"{run.task}-")
+        assert run.folder.name.endswith(f"-seed{run.seed}")
+        assert run.label in ("default", "paper")
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "label"),
+    [
+        ("pendulum-default-n1000-seed0", "phihp", "default"),
+        ("pendulum-no-q-n1000-seed0", "phihp", "no-q"),
+        ("pendulum-td3-paper-seed12", "td3", "paper"),
+        ("pendulum-cem-oracle-seed0", "cem-oracle", "default"),
+    ],
+)
+def test_a_run_without_a_cell_has_its_label_in_its_name(
+    tmp_path: Path, name: str, method: str, label: str
+) -> None:
+    folder = make_run(tmp_path, method)
+    (folder / "cell.json").unlink()
+    run = read_run(folder.rename(tmp_path / name))
+    assert (run.method, run.label, run.samples) == (method, label, 1000)
 
 
 def test_every_unfit_folder_is_named_and_the_rest_is_reported(tmp_path: Path) -> None:
@@ -338,7 +358,7 @@ def test_each_claim_gets_its_verdict(tmp_path: Path) -> None:
         make_run(tmp_path, seed=seed, acting={"planner": [9.0, 9.5], "actor": [1.0, 2.0]}, ms=4.0)
         curve = ((2000, -9.0), (9000, 9.0), (20000, 9.0))
         acting = {"planner": [9.0, 9.0]}
-        make_run(tmp_path, "tdmpc", seed=seed, samples=20000, curve=curve, acting=acting, ms=20.0)
+        make_run(tmp_path, "td-mpc", seed=seed, samples=20000, curve=curve, acting=acting, ms=20.0)
         make_run(tmp_path, "td3", seed=seed, samples=300, acting={"actor": [9.0, 11.0]})
         make_run(tmp_path, "ph-cem", seed=seed, samples=500, acting={"planner": [5.0]})
         make_run(tmp_path, "ph-cem", seed=seed, samples=5000, acting={"planner": [1.0]})
@@ -463,21 +483,21 @@ def test_a_page_without_markers_is_left_alone(tmp_path: Path) -> None:
     assert "### Time" in overview(runs)
 
 
-def test_the_recipe_reports_the_committed_runs(
+def test_the_recipe_makes_the_report_and_logs_its_figures(
     recipe: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("rliable")
-    names = [f"pendulum-default-n1000-seed{seed}" for seed in (0, 1, 2)]
-    for name in names:
-        shutil.copytree(COMMITTED / name, tmp_path / "results" / "runs" / name)
     pytest.importorskip("tensorboard")
-    recipe("report", "reps=20", "any_version=true", "logger=tensorboard")
+    for seed in (0, 1):
+        make_run(tmp_path / "results" / "runs", seed=seed)
+    recipe("report", "reps=20", "logger=tensorboard")
     assert "wrote results/report/README.md" in capsys.readouterr().out
-    means = [read_run(COMMITTED / name, any_version=True).acting["planner"].mean for name in names]
     with (tmp_path / "results/report/tables/main_return.csv").open() as file:
         row = next(csv.DictReader(file))
-    assert float(row["PhIHP mean"]) == pytest.approx(sum(means) / 3)
-    assert "### Returns with fewer real samples" in (tmp_path / "results/README.md").read_text()
+    assert (row["PhIHP mean"], row["PhIHP seeds"]) == ("-185.0", "2")
+    overview_page = (tmp_path / "results/README.md").read_text()
+    assert "### Returns with fewer real samples" in overview_page
+    assert "2 evaluation episodes each" in overview_page
     assert list((tmp_path / "outputs" / "report").rglob("*tfevents*"))
     with pytest.raises(SystemExit, match=r"^error: reps: expected a positive"):
         recipe("report", "reps=0")

@@ -27,8 +27,8 @@ def overview(runs: Sequence[Run]) -> str:
         parts += [
             f"## {label}\n",
             "PhIHP; the commands in full are in `results/runs/*/metadata.json`. Mean ± std over "
-            "seeds, 50 evaluation episodes each, from seeds that no training uses. "
-            f"{origins(chosen)}\n",
+            f"seeds, {_episodes(chosen)} evaluation episodes each, from seeds that no training "
+            f"uses. {origins(chosen)}\n",
             "### Returns at the most real samples that were used\n",
             returns_markdown(chosen),
             section_markdown(acting_section(chosen), level=2, title=False),
@@ -47,6 +47,12 @@ def origins(runs: Sequence[Run]) -> str:
         f"Seeds: {seeds}. Commits: {commits}. Machine: {machines}, shared with other work; one "
         "thread a run, so times are upper bounds."
     )
+
+
+def _episodes(runs: Sequence[Run]) -> str:
+    """How many episodes an evaluation had; several numbers if it was not the same everywhere."""
+    counts = {len(acting.returns) for run in runs for acting in run.acting.values()}
+    return " or ".join(str(count) for count in sorted(counts))
 
 
 def fill_page(page: Path, runs: Sequence[Run]) -> bool:

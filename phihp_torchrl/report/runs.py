@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -161,10 +162,9 @@ def _check_version(found: str) -> None:
 
 def _label(name: str, task: str, method: str) -> str:
     """The label in a cell's name, for runs from before there was a file that says it."""
-    rest = name.removeprefix(f"{task}-")
-    if method != DEFAULT_METHOD:
-        rest = rest.removeprefix(f"{method}-")
-    return rest.rsplit("-seed", 1)[0].rsplit("-n", 1)[0]
+    rest = name.removeprefix(f"{task}-").removeprefix(f"{method}-")
+    found = re.fullmatch(r"(?:(.+?)-)?(?:n\d+-)?seed\d+", rest)
+    return (found and found[1]) or "default"
 
 
 def _acting(evaluation: Mapping[str, Any]) -> dict[str, Acting]:

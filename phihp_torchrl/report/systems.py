@@ -22,7 +22,7 @@ class System:
 PHIHP = System("PhIHP", (("phihp", "planner"),))
 TD3_IM_PH = System("TD3-im-ph", (("td3-im-ph", "actor"), ("phihp", "actor")))
 TD3_IM_DD = System("TD3-im-dd", (("td3-im-dd", "actor"),))
-TD_MPC = System("TD-MPC", (("tdmpc", None), ("td-mpc", None)))
+TD_MPC = System("TD-MPC", (("td-mpc", None),))
 TD3 = System("TD3", (("td3", None),))
 CEM_ORACLE = System("CEM-oracle", (("cem-oracle", None),))
 PH_CEM = System("Ph-CEM", (("ph-cem", None),))
