@@ -16,8 +16,8 @@ class TensorPrioritizedSliceSampler(PrioritizedSliceSampler):
     """:class:`torchrl.data.replay_buffers.PrioritizedSliceSampler` without compiled segment trees.
 
     TorchRL's binaries do not load beside every build of torch, and its trees can be saved by pickle
-    alone. These sum a whole tensor at each sample instead, which is 0.1 ms for 100,000 priorities
-    and nothing beside the update that follows. Arguments are those of the class it extends.
+    alone. These sum a whole tensor at each sample instead, which is little beside the update that
+    follows. Arguments are those of the class it extends.
 
     References: prioritized replay, https://arxiv.org/abs/1511.05952.
 
