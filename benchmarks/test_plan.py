@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 
-import mppi
 from race import forward, products, race
 from tensordict import TensorDict
 from torchrl.modules import CEMPlanner as StockCEMPlanner
 
 from phihp_torchrl import CEMPlanner, WorldModelEnv, load_agent
-from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.agents.tdmpc import TOLD
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.planners.factory import PlannerConfig, make_planner
+from phihp_torchrl.planners.factory import (
+    MPPIConfig,
+    PlannerConfig,
+    make_latent_planner,
+    make_planner,
+)
 
 AGENT = "results/agents/pendulum-swingup"
 # SPEC section 4, PendulumSwingup.
@@ -47,8 +51,12 @@ def test_published_budget(benchmark, report):
     stock_env = WorldModelEnv(model, seed=0)
     stock = StockCEMPlanner(stock_env, 5, 3, 220, 10)
     state = env.reset(data.clone().set("observation", observation))
-    latent = mppi.Latent(observation.shape[-1], 1)
-    compiled_mppi = compile_graph(mppi.plan)
+    told = TOLD(observation.shape[-1], [2.0])  # untrained: only its time is of interest
+    encoded = TensorDict(latent=told.encode(observation).detach())
+    published_mppi = MPPIConfig(schedule_steps=0).at(0)
+    mppi, compiled_mppi = (
+        make_latent_planner(told, published_mppi, compile=compile) for compile in (False, True)
+    )
     reduced = replace(PUBLISHED, tail_dtype="bfloat16")
     times = race(
         benchmark,
@@ -58,10 +66,8 @@ def test_published_budget(benchmark, report):
             "plan, eager on tensors": acts(planner()),
             "(a) the same plan by env.step": acts(stepped),
             "(b) TorchRL's CEMPlanner, no actor, no Q": lambda: stock(state.clone()),
-            "(c) TD-MPC's MPPI, eager": lambda: mppi.plan(latent, observation, *mppi.draw_noise(1)),
-            "(c) TD-MPC's MPPI, compiled": lambda: compiled_mppi(
-                latent, observation, *mppi.draw_noise(1)
-            ),
+            "(c) TD-MPC's MPPI, eager": lambda: mppi(encoded.clone()),
+            "(c) TD-MPC's MPPI, compiled": lambda: compiled_mppi(encoded.clone()),
             "(d) the actor alone": acts(agent.actor_alone()),
             "(e) products of the plan's tail": products(tail_products(PUBLISHED, agent)),
         },
