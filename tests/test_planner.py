@@ -21,6 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MLP, AdditiveGaussianModule, MPCPlannerBase, TanhModule, WorldModel
 
 from phihp_torchrl import HybridDynamics, get_task
+from phihp_torchrl.agents import TwinQ
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.envs.world_model import WorldModelEnv
 from phihp_torchrl.planners import (
@@ -1012,3 +1013,41 @@ def test_bad_noise():
     tensordict = TensorDict(observation=torch.tensor([1.0, 0.0, 0.0]))
     with pytest.raises(ValueError, match=r"noise: expected shape \[2, 4, 32, 1\], got \[1\]"):
         planner.planning(tensordict, torch.zeros(1))
+
+
+# Reduced precision beyond the horizon.
+
+
+@pytest.mark.parametrize("backend", ["tensor", "env"])
+def test_tail_in_bfloat16(backend):
+    task, env, actor, qvalue = task_parts("pendulum")
+    tensordict = TensorDict(
+        observation=task.system.observe(task.coverage.sample([4])), batch_size=[4]
+    )
+    full, reduced = (
+        make_planner(env, actor, qvalue, tail_dtype=dtype, backend=backend)
+        for dtype in ("float32", "bfloat16")
+    )
+    noise = noise_for(full, (4,))
+    plans = [planner.plan(tensordict, noise) for planner in (full, reduced)]
+    assert plans[1].score.dtype == torch.float32
+    assert not torch.equal(plans[0].score, plans[1].score), "the tail is another one"
+    torch.testing.assert_close(plans[0].score, plans[1].score, rtol=2e-2, atol=2e-2)
+
+
+def test_the_last_layer_of_a_reduced_tail_is_exact():
+    """A value of 300 in bfloat16 would be off by up to one."""
+    task = get_task("pendulum")
+    critics = TwinQ(task, (8,))
+    with torch.no_grad():
+        critics.layers[-1].fill_(300.3)
+        critics.layers[-2].zero_()
+        with torch.autocast("cpu", torch.bfloat16):
+            values = critics(torch.zeros(3, 3), torch.zeros(3, 1))
+    assert values.dtype == torch.float32
+    assert torch.equal(values, torch.full((3, 2), 300.3))
+
+
+def test_unknown_tail_dtype():
+    with pytest.raises(ValueError, match="tail_dtype: expected 'float32' or 'bfloat16'"):
+        settings(tail_dtype="float16")

@@ -9,11 +9,10 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.objectives import SoftUpdate
 from torchrl.objectives.value import TD0Estimator
 
 from phihp_torchrl import HybridDynamics, get_task
-from phihp_torchrl.agents import Batch, TD3Config, TD3Update, make_td3_loss
+from phihp_torchrl.agents import Batch, StockTD3Update, TD3Config, TD3Update, make_td3_loss
 from phihp_torchrl.agents.functional import (
     actor_loss,
     adam_,
@@ -52,22 +51,6 @@ def make_batch(model, count):
     return Batch(state, action, reward, next_state, terminated)
 
 
-def as_tensordict(model, batch):
-    following = TensorDict(
-        observation=model.observe(batch.next_state),
-        reward=batch.reward.unsqueeze(-1),
-        terminated=batch.terminated.unsqueeze(-1),
-        done=batch.terminated.unsqueeze(-1),
-        batch_size=batch.reward.shape,
-    )
-    return TensorDict(
-        observation=model.observe(batch.state),
-        action=batch.action,
-        next=following,
-        batch_size=batch.reward.shape,
-    )
-
-
 def rows(batch, start, stop):
     return Batch(*(column[start:stop] for column in batch))
 
@@ -89,45 +72,15 @@ def same(one, other):
 # Stock TorchRL
 
 
-class Stock:
-    """TD3 as TorchRL's own parts make it: TD3Loss, two optimizers and SoftUpdate."""
-
-    def __init__(self, loss, config):
-        self.loss, self.config = loss, config
-        self.soft_update = SoftUpdate(loss, tau=config.tau)
-        self.actor_optimizer = torch.optim.Adam(
-            loss.actor_network_params.flatten_keys().values(), lr=config.actor_learning_rate
-        )
-        self.critic_optimizer = torch.optim.Adam(
-            loss.qvalue_network_params.flatten_keys().values(), lr=config.critic_learning_rate
-        )
-
-    def step(self, batches):
-        for data in batches:
-            losses = self.loss(data)
-            losses["loss_qvalue"].backward()
-            self.critic_optimizer.step()
-            self.critic_optimizer.zero_grad()
-            self.actor_optimizer.zero_grad()
-        loss_actor = self.loss(data)["loss_actor"]
-        loss_actor.backward()
-        self.actor_optimizer.step()
-        self.actor_optimizer.zero_grad()
-        self.critic_optimizer.zero_grad()
-        self.soft_update.step()
-        return {"loss_qvalue": losses["loss_qvalue"].detach(), "loss_actor": loss_actor.detach()}
-
-
 @pytest.mark.parametrize("delay", [1, 2, 3])
 @pytest.mark.parametrize("name", ["pendulum", "cartpole", "acrobot-swingup"])
 def test_equals_stock_torchrl(name, delay):
     config = replace(SMALL, target_noise=0.0, policy_delay=delay, tau=0.05, gamma=0.9)
     fused = make_update(config, name)
-    stock = Stock(copy.deepcopy(fused.loss), config)
+    stock = StockTD3Update(copy.deepcopy(fused.loss), fused.world_model, config)
     for _ in range(4):
         batch = make_batch(fused.world_model, 8 * delay)
-        parts = [rows(batch, 8 * i, 8 * (i + 1)) for i in range(delay)]
-        expected = stock.step([as_tensordict(fused.world_model, part) for part in parts])
+        expected = stock(batch)
         for key, value in fused(batch).items():
             torch.testing.assert_close(value, expected[key], rtol=1e-4, atol=1e-5)
     ours, theirs = fused.loss.state_dict(), stock.loss.state_dict()
@@ -139,13 +92,13 @@ def test_equals_stock_torchrl(name, delay):
 def test_equals_stock_torchrl_under_the_same_noise(monkeypatch):
     config = replace(SMALL, target_noise=0.4, target_noise_clip=0.5, policy_delay=1)
     fused = make_update(config)
-    stock = Stock(copy.deepcopy(fused.loss), config)
+    stock = StockTD3Update(copy.deepcopy(fused.loss), fused.world_model, config)
     batch = make_batch(fused.world_model, 64)
     noise = torch.randn(64, 1)
     monkeypatch.setattr(torch, "randn", lambda *_, **__: noise)
     monkeypatch.setattr(torch, "randn_like", lambda *_, **__: noise)
     losses = fused(batch)
-    expected = stock.step([as_tensordict(fused.world_model, batch)])
+    expected = stock(batch)
     torch.testing.assert_close(losses["loss_qvalue"], expected["loss_qvalue"])
     torch.testing.assert_close(losses["loss_actor"], expected["loss_actor"])
 
@@ -369,7 +322,8 @@ def test_learning_rates_scale():
 
 def test_parameters_are_those_of_the_loss():
     update = make_update()
-    data = as_tensordict(update.world_model, make_batch(update.world_model, 8))
+    stock = StockTD3Update(update.loss, update.world_model, SMALL)
+    data = stock.as_tensordict(make_batch(update.world_model, 8))
     before = update.loss(data)["loss_actor"].item()
     update(make_batch(update.world_model, 16))
     assert update.loss(data)["loss_actor"].item() != before

@@ -23,6 +23,7 @@ from phihp_torchrl.agents.networks import (
 )
 from phihp_torchrl.agents.refit import CriticRefit, Refit, RefitConfig
 from phihp_torchrl.agents.replay import FlatReplay
+from phihp_torchrl.agents.stock import StockTD3Update
 from phihp_torchrl.agents.td3 import (
     TD3Config,
     TD3Update,
@@ -40,6 +41,7 @@ __all__ = [
     "QNetwork",
     "Refit",
     "RefitConfig",
+    "StockTD3Update",
     "TD3Config",
     "TD3Update",
     "TwinQ",

@@ -38,6 +38,10 @@ def mlp(layers: Layers, inputs: Tensor) -> Tensor:
     """A network with ReLU between its layers, ``[N, in] -> [N, out]``."""
     for i in range(0, len(layers) - 2, 2):
         inputs = F.linear(inputs, layers[i], layers[i + 1]).relu()
+    if torch.is_autocast_enabled(inputs.device.type):
+        # The rest in half the precision would round a value of hundreds to whole numbers.
+        with torch.autocast(inputs.device.type, enabled=False):
+            return F.linear(inputs.to(layers[-2].dtype), layers[-2], layers[-1])
     return F.linear(inputs, layers[-2], layers[-1])
 
 

@@ -109,7 +109,8 @@ class SamplingPlanner(MPCPlannerBase):
         self._expected = {key: situation[key] for key in self.in_keys}
         self._compile = compile
         self._plan = plan
-        self._planning_function: Callable[..., Any] | None = None
+        # One for each set of shapes: compiled, each is a graph.
+        self._planning_functions: dict[Any, Callable[..., Any]] = {}
 
     # Construction: what fits together.
 
@@ -188,8 +189,8 @@ class SamplingPlanner(MPCPlannerBase):
             if unknown := [k for k in module.in_keys if unravel_key(k) not in allowed]:
                 raise ValueError(f"{name}: expected in_keys among {allowed}, got {unknown}.")
 
-    def _build(self) -> Callable[..., Any]:
-        """The plan as a function of observation, noise and mean."""
+    def problem(self) -> Problem:
+        """What is planned: model, bounds, actor and value as functions."""
         action_shape = self.action_spec.shape
         if self.uses_tensors:
             model: TensorModel = self.env.tensor_model
@@ -203,20 +204,33 @@ class SamplingPlanner(MPCPlannerBase):
         if self.qvalue is not None:
             value = value_function(self.qvalue, self.value_key, self.action_key, action_shape)
         bounds = ActionBounds.from_limits(self._action_low, self._action_high)
-        problem = Problem(model=model, bounds=bounds, actor=actor, value=value)
+        return Problem(model=model, bounds=bounds, actor=actor, value=value)
+
+    def _build(self) -> Callable[..., Any]:
+        """The plan as a function of observation, noise and mean."""
+        problem = self.problem()
         function = partial(self._plan, problem=problem, settings=self.settings)
         options = dict(self._compile) if isinstance(self._compile, dict) else {}
         return compile_graph(function, enabled=self._compiles, **options)
 
     def __getstate__(self) -> dict[str, Any]:
-        # The function holds on to these very modules, so a copy builds its own.
-        return {**super().__getstate__(), "_planning_function": None}
+        # The functions hold on to these very modules, so a copy builds its own.
+        return {**super().__getstate__(), "_planning_functions": {}}
 
     def _apply(self, *args: Any, **kwargs: Any) -> SamplingPlanner:
-        self._planning_function = None  # it holds the bounds as they were
+        self._planning_functions = {}  # they hold the bounds as they were
         return super()._apply(*args, **kwargs)
 
     # Planning.
+
+    def forward(
+        self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None
+    ) -> TensorDictBase:
+        """Plan, and write the action."""
+        # The stock one looks for pandas on the disk whenever it writes, a tenth of a fast plan.
+        action = self.action_spec.project(self.planning(tensordict))
+        out = tensordict if tensordict_out is None else tensordict_out
+        return out.set(self.action_key, action)
 
     @abstractmethod
     def planning(self, tensordict: TensorDictBase) -> Tensor:
@@ -234,14 +248,15 @@ class SamplingPlanner(MPCPlannerBase):
 
     def _call_plan(self, tensordict: TensorDictBase, *args: Any) -> Any:
         """Call the plan with what it is made from, and further arguments."""
-        if self._planning_function is None:
-            self._planning_function = self._build()
+        shapes = _shapes((tensordict.batch_size, args))
+        if shapes not in self._planning_functions:
+            self._planning_functions[shapes] = self._build()
         if self.uses_tensors:
             observation = tensordict.get(self.observation_key)
         else:
             observation = tensordict.select(*self.in_keys)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return self._planning_function(observation, *args)
+            return self._planning_functions[shapes](observation, *args)
 
     def _starts(self, tensordict: TensorDictBase) -> Tensor | None:
         """Where an episode starts, bool ``[*batch]``, if it is known."""
@@ -268,6 +283,13 @@ class SamplingPlanner(MPCPlannerBase):
             # Elsewhere this would wait for the device; the plan falls back to the actor's action.
             if device.type == "cpu" and not value.isfinite().all():
                 raise ValueError(f"{key}: expected finite observations, got some that are not.")
+
+
+def _shapes(arguments: Any) -> Any:
+    """The shapes of tensors, nested as they are."""
+    if isinstance(arguments, tuple) and not isinstance(arguments, torch.Size):
+        return tuple(map(_shapes, arguments))
+    return arguments.shape if isinstance(arguments, Tensor) else arguments
 
 
 def _choose(situation: Collection[NestedKey], key: NestedKey | None) -> NestedKey | None:

@@ -120,7 +120,7 @@ class MPPIPlanner(SamplingPlanner):
         # The horizon and the floor of the std are arguments of the plan; the rest is built in.
         fixed = replace(self.settings, planning_horizon=1, min_std=0.0)
         if fixed != self._built_in:
-            self._built_in, self._planning_function = fixed, None
+            self._built_in, self._planning_functions = fixed, {}
         if noise is None:
             noise = self.draw_noise(tensordict.batch_size)
         # A tensor, and not the setting itself: a schedule would compile at every step.

@@ -76,6 +76,7 @@ def score_pool(
         gamma=settings.gamma,
         alpha=settings.alpha,
         policy_noise=None if policy_noise is None else policy_noise.flatten(1, 2),
+        reduced_tail=settings.tail_dtype == "bfloat16",
     )
     return Pool(actions.view(shape), scores.view(shape[1:3]))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -81,6 +82,7 @@ def score_sequences(
     gamma: float,
     alpha: float,
     policy_noise: Tensor | None = None,
+    reduced_tail: bool = False,
 ) -> tuple[Tensor, Tensor]:
     r"""Score sequences by rolling them out in the model (paper, equation 4).
 
@@ -97,6 +99,7 @@ def score_sequences(
         alpha: weight of the value term; 0 leaves it out.
         policy_noise: makes the first ``rows'`` sequences the actor's: what is added to its actions,
             ``[H, rows', m]``, before they are clipped.
+        reduced_tail: evaluates the value term under autocast to bfloat16.
 
     Returns:
         The scores ``[rows]`` and the sequences taken ``[H, rows, m]``.
@@ -119,7 +122,9 @@ def score_sequences(
         discount *= gamma
     if alpha and problem.value is not None and actor is not None:
         observation = model.observe(state)
-        tail = problem.value(observation, actor(observation))
+        reduced = torch.autocast(total.device.type, torch.bfloat16)
+        with reduced if reduced_tail else nullcontext():
+            tail = problem.value(observation, actor(observation)).to(total.dtype)
         total = torch.where(over, total, torch.add(total, tail, alpha=alpha * discount))
     if taken:
         actions = torch.stack(taken)

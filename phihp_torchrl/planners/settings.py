@@ -26,6 +26,8 @@ class SearchSettings:
         gamma: discount.
         init_std: std of the first iteration's random candidates.
         min_std: floor of the refitted std.
+        tail_dtype: ``"float32"``, or ``"bfloat16"`` to evaluate actor and critics beyond the
+            horizon under autocast, faster and to about three digits.
 
     Raises:
         ValueError: for a value out of range, by the name of its argument.
@@ -42,6 +44,7 @@ class SearchSettings:
     gamma: float = 0.99
     init_std: float = 1.0
     min_std: float = 0.0
+    tail_dtype: str = "float32"
 
     def __post_init__(self) -> None:
         for name in ("planning_horizon", "optim_steps", "num_candidates", "top_k"):
@@ -60,6 +63,10 @@ class SearchSettings:
             raise ValueError(f"init_std: expected a finite number > 0, got {self.init_std!r}.")
         if not 0 <= self.gamma <= 1:
             raise ValueError(f"gamma: expected a number in [0, 1], got {self.gamma!r}.")
+        if self.tail_dtype not in ("float32", "bfloat16"):
+            raise ValueError(
+                f"tail_dtype: expected 'float32' or 'bfloat16', got {self.tail_dtype!r}."
+            )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,52 @@
+"""Imagined transitions against TorchRL's rollouts in the same model."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from race import race
+from tensordict.nn import TensorDictModule
+
+from phihp_torchrl import HybridDynamics, WorldModelEnv, get_task
+from phihp_torchrl.agents import Actor, Imagination, Worlds, draw_noise
+from phihp_torchrl.dynamics import TaskWorldModel
+
+
+@pytest.mark.parametrize(("worlds", "steps"), [(64, 4), (1, 2)])
+def test_transitions(benchmark, report, worlds, steps):
+    task = get_task("pendulum-swingup")
+    model = TaskWorldModel(task, HybridDynamics.hybrid(task)).requires_grad_(False)
+    actor = Actor(task)
+    layers = [p.detach() for p in actor.mlp.parameters()]
+    places = Worlds(task.reset.sample([worlds]), torch.zeros(worlds, dtype=torch.int64))
+
+    def imagines(compile):
+        imagination = Imagination(model, actor.action_high, task.max_steps, compile=compile)
+
+        def call():
+            starts = task.coverage.sample([steps, worlds])
+            noise = draw_noise(starts, actor.action_high, std=0.1, random_fraction=0.1)
+            imagination.chunk(layers, places, noise)
+
+        return call
+
+    env = WorldModelEnv(model, batch_size=[worlds])
+    policy = TensorDictModule(actor, ["observation"], ["action"])
+    length = 50 * steps  # long enough for the reset not to count
+
+    times = race(
+        benchmark,
+        {
+            "chunk, compiled": imagines(True),
+            "chunk, eager": imagines(False),
+            "env.rollout": lambda: env.rollout(length, policy, break_when_any_done=False),
+        },
+        rounds=30,
+    )
+    times["env.rollout"] = [t * steps / length for t in times["env.rollout"]]
+    note = (
+        f"{worlds} worlds of PendulumSwingup, noisy actor of 2 x 300, the time is for one step of "
+        f"all of them: {steps} to a chunk, noise drawn anew; `env.rollout` goes {length} steps "
+        "without noise."
+    )
+    report(f"Imagined steps of {worlds} worlds", times, note, work=steps)
