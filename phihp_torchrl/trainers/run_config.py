@@ -33,7 +33,7 @@ FREE_KEYS = ("checkpoint_interval", "keep_checkpoints", "progress", "logger")
 """What a resumed run may change, for it changes no result."""
 
 _NAMES = ("task", "preset", "method")
-_GROUPS = (*_NAMES, "logger")
+_GROUPS = (*_NAMES, "logger", "budget")
 _PLACES = ("run_dir", "resume")
 
 

@@ -1,0 +1,237 @@
+"""Return against latency of plans of several budgets, and the cheapest that loses nothing.
+
+    python recipes/pareto.py --tasks pendulum-swingup acrobot
+    python recipes/pareto.py --report               # the choice, on evaluation seeds, once
+
+Reads the agents in results/agents. The sweep plays paired episodes from seeds of training, and its
+choice is the budget with the fewest milliseconds whose return is, on no task, more than two
+standard errors below the published budget's. Only --report plays evaluation seeds: the published
+budget and the chosen one, 50 paired episodes. Writes results/pareto/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+
+import torch
+from matplotlib.figure import Figure
+from tensordict import TensorDict
+
+from phihp_torchrl import load_agent
+from phihp_torchrl.deployment import Agent
+from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.evaluation import (
+    EVALUATION_SEED,
+    PUBLISHED_SAMPLES,
+    evaluate,
+    markdown_table,
+    paired_difference,
+)
+from phihp_torchrl.planners.factory import PlannerConfig, make_planner
+
+AGENTS, RESULTS = Path("results/agents"), Path("results/pareto")
+SWEEP_SEED = 0  # of training: the choice must not see an evaluation seed
+# SPEC section 4: horizon and weight of Q of each task.
+TASKS = {
+    "pendulum": (5, 1.5),
+    "pendulum-swingup": (5, 1.5),
+    "cartpole": (4, 0.2),
+    "cartpole-swingup": (6, 0.03),
+    "acrobot": (4, 0.8),
+    "acrobot-swingup": (3, 0.8),
+}
+AROUND_ACTOR = {"policy_noise": 0.2, "policy_noise_clip": 0.6, "top_k": 6}
+WARM = {**AROUND_ACTOR, "warm_start": True, "num_kept_elites": 2, "init_std": 0.5}
+BUDGETS = {
+    "220 x 3, published": {},
+    "agent's own": None,
+    "64 x 2": {**WARM, "num_candidates": 64, "optim_steps": 2},
+    "64 x 1": {**WARM, "num_candidates": 64, "optim_steps": 1, "num_kept_elites": 0},
+    "64 x 1, actor's alone": {
+        **AROUND_ACTOR, "num_candidates": 64, "num_policy_candidates": 64, "optim_steps": 1
+    },
+    "32 x 2": {**WARM, "num_candidates": 32, "optim_steps": 2, "num_policy_candidates": 10},
+    "32 x 1, actor's alone": {
+        **AROUND_ACTOR, "num_candidates": 32, "num_policy_candidates": 32, "optim_steps": 1
+    },
+}  # fmt: skip
+PUBLISHED = next(iter(BUDGETS))
+
+
+def planner_config(agent: Agent, name: str) -> PlannerConfig:
+    """The published settings of the agent's task; but for the published one, our changes."""
+    changes = BUDGETS[name]
+    if changes is None:
+        return agent.planner_config
+    horizon, alpha = TASKS[agent.task.name]
+    published = PlannerConfig(planning_horizon=horizon, alpha=alpha, compare_with_actor=False)
+    if not changes:
+        return published
+    # Ours keep horizon and weight of the agent, and the actor's own action competes.
+    own = agent.planner_config
+    return replace(
+        published,
+        planning_horizon=own.planning_horizon,
+        alpha=own.alpha,
+        compare_with_actor=True,
+        **changes,
+    )
+
+
+def build(agent: Agent, name: str, compile: bool = False):
+    """The planner of a budget."""
+    model = TaskWorldModel(agent.task, agent.dynamics)
+    config = planner_config(agent, name)
+    return make_planner(model, agent.actor, agent.qvalue, config, compile=compile)
+
+
+def latencies(planners: dict, agent: Agent, calls: int) -> dict[str, float]:
+    """Median milliseconds of an action, the planners taking turns; CPU time of the one thread."""
+    states = (agent.task.coverage or agent.task.reset).sample([calls])
+    times: dict[str, list[float]] = {name: [] for name in planners}
+    for observation in agent.task.system.observe(states):
+        for name, planner in planners.items():
+            data = TensorDict(observation=observation, is_init=torch.tensor([True]))
+            start = time.thread_time()
+            planner(data)
+            times[name].append(1e3 * (time.thread_time() - start))
+    return {name: median(of[calls // 10 :]) for name, of in times.items()}
+
+
+def sweep(task: str, episodes: int, calls: int) -> dict[str, dict[str, object]]:
+    """Returns and latency of every budget on a task."""
+    agent = load_agent(AGENTS / task)
+    milliseconds = latencies({name: build(agent, name) for name in BUDGETS}, agent, calls)
+    rows: dict[str, dict[str, object]] = {}
+    for name in BUDGETS:
+        played = evaluate(build(agent, name), agent.task, episodes=episodes, seed=SWEEP_SEED)
+        rows[name] = {"ms": milliseconds[name], "returns": played.returns.tolist()}
+        print(f"{task}: {name}: {played.mean:.1f}, {milliseconds[name]:.2f} ms", flush=True)
+    return rows
+
+
+def difference(rows: dict, name: str):
+    """Mean and standard error of a budget's returns less the published one's."""
+    ours, theirs = (torch.tensor(rows[key]["returns"]) for key in (name, PUBLISHED))
+    return paired_difference(ours, theirs)
+
+
+def choose(tasks: dict[str, dict]) -> str:
+    """The cheapest budget that is on no task worse than the published one."""
+    good = [
+        name
+        for name in BUDGETS
+        if not any(difference(rows, name).is_worse for rows in tasks.values())
+    ]
+    return min(good, key=lambda name: sum(rows[name]["ms"] for rows in tasks.values()))
+
+
+def report(task: str, chosen: str, calls: int) -> dict[str, float]:
+    """The choice against the published budget, on evaluation seeds; both played once."""
+    agent = load_agent(AGENTS / task)
+    fast = build(agent, chosen, compile=True)
+    planners = {"published, eager": build(agent, PUBLISHED), "chosen, compiled": fast}
+    milliseconds = latencies(planners, agent, calls)
+    ours, theirs = (
+        evaluate(build(agent, name), agent.task, episodes=50, seed=EVALUATION_SEED)
+        for name in (chosen, PUBLISHED)
+    )
+    paired = paired_difference(ours.returns, theirs.returns)
+    return {
+        "published": theirs.mean,
+        "chosen": ours.mean,
+        "difference": paired.mean,
+        "standard_error": paired.standard_error,
+        "published_eager_ms": milliseconds["published, eager"],
+        "chosen_compiled_ms": milliseconds["chosen, compiled"],
+    }
+
+
+def write(results: dict) -> None:
+    """Tables and picture of all tasks done so far."""
+    tasks = results["tasks"]
+    figure = Figure(figsize=(3.2 * len(tasks), 3.0), layout="constrained")
+    panels = figure.subplots(1, len(tasks), squeeze=False)[0]
+    lines = []
+    for axis, (task, rows) in zip(panels, tasks.items(), strict=True):
+        for name, row in rows.items():
+            returns = torch.tensor(row["returns"])
+            gap = difference(rows, name)
+            axis.errorbar(
+                row["ms"],
+                returns.mean(),
+                yerr=gap.standard_error,
+                marker="s" if name == PUBLISHED else "o",
+                label=name,
+            )
+            cells = [f"{row['ms']:.2f}", f"{returns.mean():.1f}"]
+            gap_text = f"{gap.mean:+.1f} ± {gap.standard_error:.1f}"
+            lines.append([task, name, *cells, gap_text])
+        axis.set_title(task)
+        axis.set_xscale("log")
+        axis.set_xlabel("ms for an action, eager")
+    panels[0].set_ylabel("return")
+    panels[-1].legend(fontsize=6)
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    figure.savefig(RESULTS / "pareto.png", dpi=110)
+    (RESULTS / "pareto.json").write_text(json.dumps(results, indent=1) + "\n")
+    header = ["task", "candidates x iterations", "ms", "return", "less the published"]
+    text = (
+        "# Return against latency\n\n"
+        "Made by `python recipes/pareto.py`. Paired episodes from seeds of training, "
+        f"{results['episodes']} a budget; eager plans, CPU milliseconds. Chosen: "
+        f"**{choose(tasks)}**.\n\n![pareto](pareto.png)\n\n{markdown_table(header, lines)}"
+    )
+    if reported := results.get("report"):
+        header = ["task", "published", "chosen", "difference", "published, eager, ms"]
+        header += ["chosen, compiled, ms", "times faster"]
+        lines = [
+            [
+                task,
+                f"{row['published']:.1f}",
+                f"{row['chosen']:.1f}",
+                f"{row['difference']:+.1f} ± {row['standard_error']:.1f}",
+                f"{row['published_eager_ms']:.2f}",
+                f"{row['chosen_compiled_ms']:.2f}",
+                f"{row['published_eager_ms'] / row['chosen_compiled_ms']:.1f}",
+            ]
+            for task, row in reported["rows"].items()
+        ]
+        text += (
+            "\n## On evaluation seeds\n\n`python recipes/pareto.py --report`: "
+            f"{reported['chosen']}, 50 paired episodes.\n\n{markdown_table(header, lines)}"
+        )
+    (RESULTS / "README.md").write_text(text)
+
+
+@torch.no_grad()
+def main() -> None:
+    """Sweep, or report the choice."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tasks", nargs="+", choices=list(PUBLISHED_SAMPLES), default=list(TASKS))
+    parser.add_argument("--episodes", type=int, default=20, help="a budget, from training seeds")
+    parser.add_argument("--calls", type=int, default=100, help="timed actions a budget")
+    parser.add_argument("--report", action="store_true", help="the choice, on evaluation seeds")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    torch.manual_seed(SWEEP_SEED)
+    path = RESULTS / "pareto.json"
+    if arguments.report:
+        results = json.loads(path.read_text())
+        chosen = choose(results["tasks"])
+        rows = {task: report(task, chosen, arguments.calls) for task in results["tasks"]}
+        results["report"] = {"chosen": chosen, "rows": rows}
+    else:
+        swept = {task: sweep(task, arguments.episodes, arguments.calls) for task in arguments.tasks}
+        results = {"episodes": arguments.episodes, "tasks": swept}
+    write(results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""The sweep of planning budgets: what it plays, what it chooses, what it writes."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from phihp_torchrl import HybridDynamics, get_task
+from phihp_torchrl.agents import Actor, TwinQ
+from phihp_torchrl.deployment import Agent
+from phihp_torchrl.evaluation import EVALUATION_SEED
+from phihp_torchrl.planners.factory import PlannerConfig
+
+RECIPE = Path(__file__).parents[1] / "recipes" / "pareto.py"
+TINY = PlannerConfig(
+    planning_horizon=2, optim_steps=1, num_candidates=4, top_k=2, num_policy_candidates=2, alpha=0.7
+)
+
+
+@pytest.fixture
+def recipe(tmp_path, monkeypatch):
+    spec = importlib.util.spec_from_file_location("pareto_recipe", RECIPE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    task = replace(get_task("pendulum"), max_steps=2)
+    parts = {"actor": Actor(task, (4,)), "qvalue": TwinQ(task, (4,)), "planner_config": TINY}
+    agent = Agent(task, dynamics=HybridDynamics.hybrid(task), **parts)
+    monkeypatch.setattr(module, "load_agent", lambda path: agent)
+    monkeypatch.setattr(module, "RESULTS", tmp_path)
+    return module
+
+
+def rows(**returns):
+    return {name: {"ms": ms, "returns": [r, r + 1.0, r + 2.0]} for name, (ms, r) in returns.items()}
+
+
+def test_the_cheapest_that_loses_nothing(recipe, monkeypatch):
+    monkeypatch.setattr(recipe, "BUDGETS", dict.fromkeys(["published", "cheap", "bad"]))
+    monkeypatch.setattr(recipe, "PUBLISHED", "published")
+    one = rows(published=(9.0, 0.0), cheap=(2.0, 0.0), bad=(1.0, 0.0))
+    assert recipe.choose({"a": one}) == "bad"
+    other = rows(published=(9.0, 0.0), cheap=(2.0, 1.0), bad=(1.0, -5.0))
+    assert recipe.choose({"a": one, "b": other}) == "cheap"
+
+
+def test_budgets(recipe):
+    agent = recipe.load_agent("")
+    published = recipe.planner_config(agent, recipe.PUBLISHED)
+    assert (published.num_candidates, published.optim_steps) == (220, 3)
+    assert not published.compare_with_actor
+    assert recipe.planner_config(agent, "agent's own") == TINY
+    for name in recipe.BUDGETS:
+        assert recipe.build(agent, name).settings.planning_horizon in (2, 5)
+
+
+def test_the_choice_never_sees_an_evaluation_seed(recipe, monkeypatch, capsys):
+    seeds, play = [], recipe.evaluate
+
+    def watched(policy, task, *, episodes, seed):
+        seeds.append(seed)
+        return play(policy, task, episodes=2, seed=seed)
+
+    monkeypatch.setattr(recipe, "evaluate", watched)
+    monkeypatch.setattr(sys, "argv", ["pareto.py", "--tasks", "pendulum", "--calls", "10"])
+    recipe.main()
+    assert set(seeds) == {recipe.SWEEP_SEED}
+    assert recipe.SWEEP_SEED < EVALUATION_SEED
+    assert len(seeds) == len(recipe.BUDGETS)
+    assert (recipe.RESULTS / "pareto.png").is_file()
+    # The report plays the two that it compares once each.
+    build = recipe.build
+    monkeypatch.setattr(recipe, "build", lambda agent, name, compile=False: build(agent, name))
+    monkeypatch.setattr(sys, "argv", ["pareto.py", "--report", "--calls", "10"])
+    seeds.clear()
+    recipe.main()
+    assert seeds == [EVALUATION_SEED] * 2
+    results = json.loads((recipe.RESULTS / "pareto.json").read_text())
+    assert results["report"]["chosen"] in recipe.BUDGETS
+    assert "On evaluation seeds" in (recipe.RESULTS / "README.md").read_text()
+    assert torch.get_num_threads() == 1
