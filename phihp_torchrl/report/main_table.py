@@ -37,7 +37,7 @@ def main_table(results: Results) -> Section:
             "Real samples to 90 % of the best return": _table(
                 "main_samples", samples, _published_samples
             ),
-            "Milliseconds for an action, median": _table(
+            "Milliseconds for an action, mean": _table(
                 "main_milliseconds", milliseconds, _published_milliseconds
             ),
         },

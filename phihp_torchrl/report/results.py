@@ -46,8 +46,8 @@ class Score:
 
     @property
     def milliseconds(self) -> float | None:
-        """Median time of an action, if it was measured."""
-        return self.result.latency.get("p50")
+        """Mean time of an action, if measured; where plans are remembered the median is not it."""
+        return self.result.latency.get("mean")
 
 
 class Results:
