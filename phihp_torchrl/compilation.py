@@ -1,8 +1,8 @@
 """How the hot paths are compiled: one full graph each, its matrix products by oneDNN.
 
 On a CPU, ATen hands products of float32 matrices to its BLAS. At the sizes met here, tens to
-thousands of rows through layers of 200 to 300 units, oneDNN is up to twice as fast on processors
-for which that BLAS has no AVX-512 kernels, and about as fast on others; ATen itself asks it for
+thousands of rows through layers of 200 to 300 units, oneDNN is faster on processors for which that
+BLAS has no AVX-512 kernels (``make bench`` has the ratio to ``torch.mm``); ATen itself asks it for
 reduced precision alone. So the compiler is told to ask for it.
 """
 
