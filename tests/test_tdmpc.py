@@ -325,16 +325,17 @@ def test_targets_follow_every_other_update():
         torch.testing.assert_close(target, 0.75 * old + 0.25 * new)
 
 
-def test_rates_and_clipping():
-    """Adam's first step is the rate, whatever the gradient; SGD would show the clipping."""
+@pytest.mark.parametrize("scale", [1.0, 0.05])
+def test_rates_and_their_scale(scale):
+    """Adam's first step is the rate, whatever the gradient."""
     config = TDMPCConfig(learning_rate=1e-2, critic_learning_rate=1e-4)
     told = make_told()
     before = {name: p.clone() for name, p in told.named_parameters()}
-    TDMPCUpdate(told, config)(make_slices())
+    TDMPCUpdate(told, config)(make_slices(), scale)
     for name, p in told.named_parameters():
         step = (p - before[name]).abs().max().item()
         rate = 1e-4 if name.startswith("critics") else 1e-2
-        assert step == pytest.approx(rate, rel=0.02), name
+        assert step == pytest.approx(scale * rate, rel=0.02), name
 
 
 def test_gradients_are_clipped_for_model_and_policy_apart():
@@ -348,10 +349,10 @@ def test_gradients_are_clipped_for_model_and_policy_apart():
 def test_an_update_goes_on_from_its_state():
     ours, theirs = (TDMPCUpdate(make_told(seed), TDMPCConfig()) for seed in (0, 1))
     for seed in range(3):
-        ours(make_slices(seed=seed), torch.Generator().manual_seed(seed))
+        ours(make_slices(seed=seed), generator=torch.Generator().manual_seed(seed))
     theirs.load_state_dict(ours.state_dict())
     for update in (ours, theirs):
-        update(make_slices(seed=9), torch.Generator().manual_seed(9))
+        update(make_slices(seed=9), generator=torch.Generator().manual_seed(9))
     for a, b in zip(ours.loss.parameters(), theirs.loss.parameters(), strict=True):
         assert torch.equal(a, b)
 
@@ -378,7 +379,7 @@ def test_learning_beyond_chance_on_a_tiny_problem():
                 ),
                 batch_size=[64, 1],
             ),
-            generator,
+            generator=generator,
         )
     observation = torch.linspace(-0.9, 0.9, 50).unsqueeze(-1)
     error = (told.policy(told.encode(observation)) - observation).square().mean()

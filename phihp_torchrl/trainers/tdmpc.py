@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from phihp_torchrl.agents import learning_rate_scale
 from phihp_torchrl.agents.tdmpc import TOLD, EpisodeReplay, TDMPCConfig, TDMPCUpdate
 from phihp_torchrl.deployment.tdmpc import TDMPCAgent
 from phihp_torchrl.evaluation import evaluate
@@ -36,6 +37,7 @@ class TDMPCTrainConfig:
         replay_capacity: transitions kept, with the padding of each episode's end.
         priority_alpha: how much priorities count, α.
         priority_beta: how much importance weights correct for it, β.
+        decay: the share of the updates, at the end, over which learning rates fall to a twentieth.
         evaluation_interval: real steps between two evaluations, for the log alone.
         evaluation_episodes: episodes of the planner without noise in the simulated real world in
             an evaluation; 0 for none.
@@ -51,6 +53,7 @@ class TDMPCTrainConfig:
     replay_capacity: int = 1_000_000
     priority_alpha: float = 0.6
     priority_beta: float = 0.4
+    decay: float = 0.0
     evaluation_interval: int = 5000
     evaluation_episodes: int = 10
     learn: TDMPCConfig = field(default_factory=TDMPCConfig)
@@ -67,6 +70,8 @@ class TDMPCTrainConfig:
             raise ValueError(
                 f"updates_per_step: expected a positive number, got {self.updates_per_step}."
             )
+        if not 0 <= self.decay <= 1:
+            raise ValueError(f"decay: expected a number in [0, 1], got {self.decay}.")
         if self.replay_capacity < 2 * self.horizon:
             raise ValueError(
                 f"replay_capacity: expected at least two slices of horizon={self.horizon}, "
@@ -230,10 +235,13 @@ class TDMPCTrainer:
     def _learn(self) -> dict[str, float]:
         """The next updates that are due; their mean losses."""
         count = min(int(self.updates_due), UNIT_UPDATES)
+        total = self.config.real_steps * self.config.updates_per_step
         sums: dict[str, Tensor] = {}
         for _ in range(count):
             slices = self.replay.sample()
-            losses = self.update(slices, self.generator)
+            left = 1.0 - self.update.updates / total
+            scale = learning_rate_scale(left, self.config.decay)
+            losses = self.update(slices, scale, self.generator)
             self.replay.update_priority(slices, losses["td_error"])
             for name, value in losses.items():
                 sums[name] = sums.get(name, torch.zeros(())) + value.mean()

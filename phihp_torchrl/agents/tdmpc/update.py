@@ -72,15 +72,20 @@ class TDMPCUpdate:
             {"params": policy},
         ]
         self.optimizer = torch.optim.Adam(groups, lr=config.learning_rate, fused=True)
+        self._rates = [group["lr"] for group in self.optimizer.param_groups]
         self.updates = 0
 
     def __call__(
-        self, slices: TensorDictBase, generator: torch.Generator | None = None
+        self,
+        slices: TensorDictBase,
+        learning_rate_scale: float = 1.0,
+        generator: torch.Generator | None = None,
     ) -> dict[str, Tensor]:
         """Take one step.
 
         Args:
             slices: what :class:`TDMPCLoss` reads, ``[N, H]``.
+            learning_rate_scale: factor on all learning rates.
             generator: source of the noise on the policy's actions.
 
         Returns:
@@ -91,6 +96,8 @@ class TDMPCUpdate:
         (losses["loss_model"] + losses["loss_policy"]).backward()
         for parameters in self._clipped:
             torch.nn.utils.clip_grad_norm_(parameters, self.config.max_grad_norm)
+        for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):
+            group["lr"] = learning_rate_scale * rate
         self.optimizer.step()
         self.updates += 1
         if self.updates % self.config.target_interval == 0:
