@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from race import race
-from tensordict.nn import TensorDictModule
+from race import forward, products, race
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import AdditiveGaussianModule
 
 from phihp_torchrl import HybridDynamics, WorldModelEnv, get_task
 from phihp_torchrl.agents import Actor, Imagination, Worlds, draw_noise
@@ -32,21 +34,33 @@ def test_transitions(benchmark, report, worlds, steps):
 
     env = WorldModelEnv(model, batch_size=[worlds])
     policy = TensorDictModule(actor, ["observation"], ["action"])
+    noisy = TensorDictSequential(
+        policy, AdditiveGaussianModule(env.action_spec, sigma_init=0.1, sigma_end=0.1)
+    )
     length = 50 * steps  # long enough for the reset not to count
 
+    def explore(length):
+        with set_exploration_type(ExplorationType.RANDOM):
+            env.rollout(length, noisy, break_when_any_done=False)
+
+    sizes = [env.observation_spec["observation"].shape[-1], 300, 300, 1]
     times = race(
         benchmark,
         {
             "chunk, compiled": imagines(True),
             "chunk, eager": imagines(False),
             "env.rollout": lambda: env.rollout(length, policy, break_when_any_done=False),
+            "env.rollout, noisy": lambda: explore(length),
+            "the actor's products": products(steps * forward(worlds, sizes)),
         },
         rounds=30,
     )
-    times["env.rollout"] = [t * steps / length for t in times["env.rollout"]]
+    for name in ("env.rollout", "env.rollout, noisy"):
+        times[name] = [t * steps / length for t in times[name]]
     note = (
         f"{worlds} worlds of PendulumSwingup, noisy actor of 2 x 300, the time is for one step of "
-        f"all of them: {steps} to a chunk, noise drawn anew; `env.rollout` goes {length} steps "
-        "without noise."
+        f"all of them: {steps} to a chunk, noise and starts drawn anew; `env.rollout` goes "
+        f"{length} steps, without noise or with TorchRL's. The last row is `torch.mm` on the "
+        "actor's shapes."
     )
     report(f"Imagined steps of {worlds} worlds", times, note, work=steps)

@@ -2,14 +2,15 @@
 
     python docs/departures.py
 
-It compares the two presets on every task and rewrites the settings in the table of docs/recipes.md.
-The columns "why" and "measured effect" are people's and stay as they are; a departure that is new
-gets an empty reason. mkdocs runs it as a hook, which only checks: a table that is out of date or a
-departure without a reason stops the build.
+It compares the two presets on every task and rewrites the table of docs/recipes.md: the settings
+from the YAML files, the measured effects from results/departures/. The column "why" is people's and
+stays as it is; a departure that is new gets an empty reason. mkdocs runs it as a hook, which only
+checks: a table that is out of date or a departure without a reason stops the build.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ PAGE = ROOT / "docs" / "recipes.md"
 CONFIG = ROOT / "recipes" / "config"
 START, END = "<!-- departures:start -->\n", "<!-- departures:end -->"
 HEADER = "| # | key | paper | default | why | measured effect |\n|---:|:---|:---|:---|:---|:---|\n"
-NEW = ("", "not yet measured")
+EFFECTS = ROOT / "results" / "departures" / "departures.json"
 
 
 def settings(preset: str) -> dict[str, dict[str, Any]]:
@@ -48,14 +49,15 @@ def departures() -> dict[str, tuple[str, str]]:
 
 def table(page: str) -> str:
     """The table as it should be, with the reasons that ``page`` has."""
+    effects = json.loads(EFFECTS.read_text()) if EFFECTS.exists() else {}
     reasons = {}
     for line in page.split(START)[1].split(END)[0].splitlines()[2:]:
         cells = [cell.strip() for cell in line.strip("|").split(" | ")]
-        reasons[cells[1].strip("`")] = (cells[4], cells[5])
+        reasons[cells[1].strip("`")] = cells[4]
     rows = [
-        f"| {number} | `{key}` | {paper} | {ours} | {why} | {effect} |\n"
+        f"| {number} | `{key}` | {paper} | {ours} | {reasons.get(key, '')} "
+        f"| {effects.get(key, {}).get('effect', 'not measured')} |\n"
         for number, (key, (paper, ours)) in enumerate(departures().items(), 1)
-        for why, effect in [reasons.get(key, NEW)]
     ]
     return HEADER + "".join(rows)
 
