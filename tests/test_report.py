@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from test_recipes import RECIPES, recipe
 
 from phihp_torchrl import get_task
+from phihp_torchrl.evaluation import DEFAULT_SAMPLES
 from phihp_torchrl.report import (
     BOUNDS,
     NOT_RUN,
@@ -50,6 +52,7 @@ from phihp_torchrl.report.systems import (
     TD3_IM_PH,
     TD_MPC,
 )
+from phihp_torchrl.report.time_to_return import seconds_to
 
 __all__ = ["recipe"]  # a fixture
 
@@ -264,7 +267,7 @@ def test_a_policy_from_a_model_has_a_point_for_each_number_of_samples(tmp_path: 
         "PhIHP": [((200, 1000), (-185.0, -120.0))]
     }
     # The planner's score counts for PhIHP, the actor's for TD3-im-ph: one run gives both.
-    assert [score.mean for score in found.best_fed(TD3_IM_PH, "pendulum")] == [-150.0]
+    assert [score.mean for score in found.usual(TD3_IM_PH, "pendulum")] == [-150.0]
     assert update_curves(found, "pendulum") == {}
     assert len(update_curves(results(tmp_path), "cartpole")) == 0
 
@@ -394,6 +397,52 @@ def test_hybrid_and_data_driven_are_compared_at_equal_samples_alone(tmp_path: Pa
 
 
 # --- writing -------------------------------------------------------------------------------------
+
+
+def test_the_default_presets_samples_go_before_more(tmp_path: Path) -> None:
+    for samples, earned in ((200, -300.0), (1000, -200.0), (2000, -100.0)):
+        make_run(tmp_path, samples=samples, acting={"actor": [earned], "planner": [earned]})
+    make_run(tmp_path, method="td3", samples=30_000, kind=None, acting={"actor": [-150.0]})
+    found = results(tmp_path)
+    assert [score.mean for score in found.usual(PHIHP, "pendulum")] == [-200.0]
+    assert [score.mean for score in found.usual(TD3, "pendulum")] == [-150.0]
+
+
+def test_the_default_preset_takes_the_samples_that_reports_think() -> None:
+    for task, samples in DEFAULT_SAMPLES.items():
+        path = RECIPES / "config" / "task" / f"{task}.yaml"
+        preset = yaml.safe_load(path.read_text())["presets"]["default"]
+        assert preset["model"]["real_steps"] == samples, task
+
+
+def test_seconds_to_a_return(tmp_path: Path) -> None:
+    """During training by the clock of the curve, at the end by all of it, else never."""
+    curve = ((1000, -900.0), (1000, -300.0), (1000, -150.0))
+    run = read_run(make_run(tmp_path, curve=curve))
+    assert seconds_to(run, -300.0) == 1.0
+    assert seconds_to(run, -200.0) == 2.0
+    last = read_run(make_run(tmp_path, seed=1, curve=curve[:1]))
+    assert seconds_to(last, -200.0) == 30.0
+    assert seconds_to(last, -100.0) is None
+
+
+def test_time_to_the_published_return_against_published_updates(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    make_run(runs, curve=((1000, -900.0), (1000, -200.0)))
+    make_run(runs, seed=1, curve=((1000, -900.0),))
+    make_run(runs, task="cartpole", acting={"planner": [9.0, 9.0], "actor": [8.0, 8.0]})
+    rows = [["fused step, compiled", "2.0", "1.00"]]
+    timed = tmp_path / "benchmarks.json"
+    timed.write_text(json.dumps({"A TD3 update of 64 transitions": {"rows": rows}}))
+    report(tmp_path, runs, benchmarks=str(timed))
+    pendulum, cartpole = table(tmp_path, "time_to_return")
+    assert float(pendulum["s to it mean"]) == pytest.approx((1.0 + 30.0) / 2)
+    assert float(pendulum["published updates, s"]) == pytest.approx(1000.0)
+    assert float(pendulum["times our s to it"]) == pytest.approx(1000.0 / 15.5)
+    assert cartpole["reached by"] == "0 of 1"
+    assert cartpole["times our s to it"] == NOT_RUN
+    report(tmp_path, runs, benchmarks=str(tmp_path / "none.json"))
+    assert table(tmp_path, "time_to_return")[0]["published updates, s"] == NOT_RUN
 
 
 def test_the_whole_report(tmp_path: Path) -> None:

@@ -18,7 +18,14 @@ from phihp_torchrl.evaluation.prediction import (
     prediction_errors,
     unseen_episodes,
 )
-from phihp_torchrl.evaluation.published import PUBLISHED, PUBLISHED_SAMPLES, TARGETS, Published
+from phihp_torchrl.evaluation.published import (
+    DEFAULT_SAMPLES,
+    PUBLISHED,
+    PUBLISHED_SAMPLES,
+    PUBLISHED_UPDATES,
+    TARGETS,
+    Published,
+)
 from phihp_torchrl.evaluation.returns import (
     Evaluation,
     PairedDifference,
@@ -30,11 +37,13 @@ from phihp_torchrl.evaluation.table import TaskResult, markdown_table, mean_and_
 from phihp_torchrl.evaluation.video import write_gif
 
 __all__ = [
+    "DEFAULT_SAMPLES",
     "EVALUATION_SEED",
     "PREDICTION_EPISODES",
     "PREDICTION_STEPS",
     "PUBLISHED",
     "PUBLISHED_SAMPLES",
+    "PUBLISHED_UPDATES",
     "TARGETS",
     "CurvePoint",
     "Episode",

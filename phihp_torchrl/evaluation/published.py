@@ -82,6 +82,14 @@ PUBLISHED_SAMPLES = MappingProxyType(
 )
 """Real samples that PhIHP may use, by task."""
 
+DEFAULT_SAMPLES = MappingProxyType({task: n // 2 for task, n in PUBLISHED_SAMPLES.items()})
+"""Real samples that PhIHP takes in the default preset, by task."""
+
+PUBLISHED_UPDATES = MappingProxyType(
+    {task: 2_000_000 if task == "acrobot-swingup" else 500_000 for task in PUBLISHED_SAMPLES}
+)
+"""Imagined steps of the paper, each with an update, by task (SPEC section 4)."""
+
 TARGETS = MappingProxyType(
     {
         "pendulum": -220.0,

@@ -21,10 +21,10 @@ def ablation(results: Results) -> Section:
     run = [s for s in _SYSTEMS if any(results.has_run(s, task) for task in SIX_TASKS)]
     common = [task for task in SIX_TASKS if run and all(results.has_run(s, task) for s in run)]
     metrics: dict[str, Callable[[System, str], Sequence[float]]] = {
-        "normalised return": lambda s, t: [x.normalised for x in results.best_fed(s, t)],
+        "normalised return": lambda s, t: [x.normalised for x in results.usual(s, t)],
         "real samples to 90 %": lambda s, t: sample_efficiency(results, s, t),
         "ms for an action": lambda s, t: [
-            x.milliseconds for x in results.best_fed(s, t) if x.milliseconds is not None
+            x.milliseconds for x in results.usual(s, t) if x.milliseconds is not None
         ],
     }
     missing = [system.name for system in _SYSTEMS if system not in run]

@@ -16,6 +16,7 @@ from phihp_torchrl.evaluation import (
     returns_table,
 )
 from phihp_torchrl.report.parts import Cell, Number, Section, Stat, Table
+from phihp_torchrl.report.results import usual_samples
 from phihp_torchrl.report.runs import Run
 
 _SHARES = {"all samples": 1.0, "a half": 0.5, "a fifth": 0.2, "a tenth": 0.1}
@@ -34,13 +35,19 @@ def both_ways(runs: Iterable[Run]) -> dict[tuple[str, int], list[Run]]:
     )
 
 
+def usual_groups(runs: Iterable[Run]) -> dict[str, list[Run]]:
+    """PhIHP's runs at the usual number of real samples, by task."""
+    groups = both_ways(runs)
+    numbers: dict[str, list[int]] = {}
+    for task, samples in groups:
+        numbers.setdefault(task, []).append(samples)
+    return {task: groups[task, usual_samples(task, of)] for task, of in numbers.items()}
+
+
 def returns_markdown(runs: Iterable[Run]) -> str:
-    """The README's table: returns at the most real samples that were used."""
-    full: dict[str, list[Run]] = {}
-    for (task, _), group in both_ways(runs).items():
-        full.setdefault(task, group)
+    """The README's table: returns at the usual number of real samples."""
     results = []
-    for task, group in full.items():
+    for task, group in usual_groups(runs).items():
         planner, actor = (tuple(run.acting[way].mean for run in group) for way in _WAYS)
         results.append(TaskResult(task, group[0].samples, planner, actor))
     return returns_table(results)

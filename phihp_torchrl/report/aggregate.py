@@ -104,7 +104,7 @@ def score_matrix(
     Where tasks have been run with different numbers of seeds, the first ones of each are taken, as
     many as all have.
     """
-    columns = [[s.normalised for s in results.best_fed(system, task)] for task in tasks]
+    columns = [[s.normalised for s in results.usual(system, task)] for task in tasks]
     seeds = min(map(len, columns), default=0)
     return np.array([column[:seeds] for column in columns]).T if seeds else None
 

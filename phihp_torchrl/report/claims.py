@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from phihp_torchrl.evaluation import PUBLISHED
-from phihp_torchrl.report.acting import both_ways, planning_gain
+from phihp_torchrl.report.acting import planning_gain, usual_groups
 from phihp_torchrl.report.efficiency import sample_efficiency
 from phihp_torchrl.report.parts import NOT_RUN, Section
 from phihp_torchrl.report.results import TASKS, Results, Score
@@ -81,21 +81,21 @@ def fewer_samples(results: Results) -> list[Finding]:
 
 
 def planning_improves(results: Results) -> list[Finding]:
-    """Planner less actor at the most real samples, by task; beyond two standard errors."""
-    findings: dict[str, Finding] = {}
-    for (task, _), group in both_ways(results.runs).items():
+    """Planner less actor at the usual number of samples, by task; beyond two standard errors."""
+    findings = []
+    for task, group in usual_groups(results.runs).items():
         gain = planning_gain(group)
         figure = f"{_text(gain.mean, '+')} ± {_text(gain.standard_error)}"
         better = gain.mean > 2 * gain.standard_error
-        findings.setdefault(task, Finding(task, better, figure))
-    return [*findings.values()]
+        findings.append(Finding(task, better, figure))
+    return findings
 
 
 def faster(results: Results) -> list[Finding]:
     """TD-MPC's time of an action over PhIHP's, by task."""
     findings = []
     for task in TASKS:
-        ours, theirs = (_times(results.best_fed(system, task)) for system in (PHIHP, TD_MPC))
+        ours, theirs = (_times(results.usual(system, task)) for system in (PHIHP, TD_MPC))
         if ours and theirs:
             ratio = fmean(theirs) / fmean(ours)
             figure = f"{ratio:.1f} times ({fmean(ours):.1f} ms against {fmean(theirs):.1f})"
@@ -108,7 +108,7 @@ def _higher(results: Results, pairs: Iterable[tuple[System, System]]) -> list[Fi
     findings = []
     for first, second in pairs:
         for task in TASKS:
-            ours, theirs = results.best_fed(first, task), results.best_fed(second, task)
+            ours, theirs = results.usual(first, task), results.usual(second, task)
             if first is not PHIHP:
                 ours, theirs = _at_equal_samples(results, first, second, task)
             if ours and theirs:

@@ -85,11 +85,11 @@ def sample_curves(results: Results, systems: Sequence[System], task: str) -> Cur
 
 
 def update_curves(results: Results, task: str) -> Curves:
-    """Updates and returns of each seed, at the most real samples."""
+    """Updates and returns of each seed, at the usual number of real samples."""
     curves = {}
     for system in (*IMAGINED, TD3):
         seeds = []
-        for score in results.best_fed(system, task):
+        for score in results.usual(system, task):
             points = [p for p in score.run.curve if p.acting == "actor" and p.updates == p.updates
                       and p.phase != "evaluate"]  # fmt: skip
             if points:

@@ -19,6 +19,7 @@ from phihp_torchrl.report.results import Results
 from phihp_torchrl.report.runs import read_runs
 from phihp_torchrl.report.sensitivity import read_trials, sensitivity
 from phihp_torchrl.report.significance import significance
+from phihp_torchrl.report.time_to_return import time_to_return
 from phihp_torchrl.report.write import write_report
 
 
@@ -29,6 +30,7 @@ class ReportConfig:
     Args:
         runs: directory with a folder for each run.
         sensitivity: directory of ``recipes/sensitivity.py``'s data.
+        benchmarks: what ``make bench`` wrote.
         out: directory of the report.
         label: the settings whose runs it is on.
         any_version: whether to take runs of other versions of this package.
@@ -39,6 +41,7 @@ class ReportConfig:
 
     runs: str = "results/runs"
     sensitivity: str = "results/sensitivity"
+    benchmarks: str = "results/benchmarks/benchmarks.json"
     out: str = "results/report"
     label: str = "default"
     any_version: bool = False
@@ -87,6 +90,11 @@ def make_report(config: ReportConfig) -> Report:
         _make("TD3 in imagination", lambda: imagined_curves(results), problems),
         _make("Sensitivity", lambda: sensitivity(trials), problems),
         _make("PhIHP, planner and actor", lambda: acting_section(chosen), problems),
+        _make(
+            "From nothing to the published return",
+            lambda: time_to_return(chosen, Path(config.benchmarks)),
+            problems,
+        ),
     ]
     if problems:
         sections.append(_left_out(problems))

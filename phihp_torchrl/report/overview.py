@@ -29,7 +29,7 @@ def overview(runs: Sequence[Run]) -> str:
             "PhIHP; the commands in full are in `results/runs/*/metadata.json`. Mean ± std over "
             f"seeds, {_episodes(chosen)} evaluation episodes each, from seeds that no training "
             f"uses. {origins(chosen)}\n",
-            "### Returns at the most real samples that were used\n",
+            "### Returns at the default preset's number of real samples, else at the most\n",
             returns_markdown(chosen),
             section_markdown(acting_section(chosen), level=2, title=False),
         ]

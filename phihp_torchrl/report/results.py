@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from phihp_torchrl.evaluation import PUBLISHED_SAMPLES, TARGETS
+from phihp_torchrl.evaluation import DEFAULT_SAMPLES, PUBLISHED_SAMPLES, TARGETS
 from phihp_torchrl.report.bounds import normalise
 from phihp_torchrl.report.runs import Acting, Run
 from phihp_torchrl.report.systems import System
@@ -15,6 +15,17 @@ TASKS = tuple(PUBLISHED_SAMPLES)
 
 SIX_TASKS = tuple(TARGETS)
 """The six tasks that averages are over."""
+
+
+def usual_samples(task: str, numbers: Collection[int]) -> int:
+    """The number of real samples to compare at: the default preset's if it is there, or the most.
+
+    Examples:
+        >>> usual_samples("pendulum", [200, 1000, 2000]), usual_samples("pendulum", [200, 30_000])
+        (1000, 30000)
+    """
+    default = DEFAULT_SAMPLES.get(task)
+    return default if default is not None and default in numbers else max(numbers, default=0)
 
 
 @dataclass(frozen=True)
@@ -72,11 +83,11 @@ class Results:
                     found.setdefault((run.samples, run.seed), Score(run, acting))
         return [found[key] for key in sorted(found)]
 
-    def best_fed(self, system: System, task: str) -> list[Score]:
-        """The scores with the most real samples that the system was run with, by seed."""
+    def usual(self, system: System, task: str) -> list[Score]:
+        """The scores at the usual number of real samples, by seed."""
         scores = self.scores(system, task)
-        most = max((score.run.samples for score in scores), default=0)
-        return [score for score in scores if score.run.samples == most]
+        chosen = usual_samples(task, {score.run.samples for score in scores})
+        return [score for score in scores if score.run.samples == chosen]
 
     def has_run(self, system: System, task: str) -> bool:
         """Whether there is a score."""

@@ -72,9 +72,9 @@ def significance(results: Results) -> Section:
     """A row for each task and baseline."""
     rows: list[list[Cell]] = []
     for task in TASKS:
-        ours = [score.mean for score in results.best_fed(PHIHP, task)]
+        ours = [score.mean for score in results.usual(PHIHP, task)]
         for baseline in BASELINES:
-            theirs = [score.mean for score in results.best_fed(baseline, task)]
+            theirs = [score.mean for score in results.usual(baseline, task)]
             test, published = welch(ours, theirs), welch_published(task, baseline.name)
             short = "not run" if not (ours and theirs) else "too few seeds"
             rows.append([
