@@ -227,10 +227,12 @@ def main() -> None:
         chosen = choose(results["tasks"])
         rows = {task: report(task, chosen, arguments.calls) for task in results["tasks"]}
         results["report"] = {"chosen": chosen, "rows": rows}
-    else:
-        swept = {task: sweep(task, arguments.episodes, arguments.calls) for task in arguments.tasks}
-        results = {"episodes": arguments.episodes, "tasks": swept}
-    write(results)
+        write(results)
+        return
+    swept = {}
+    for task in arguments.tasks:
+        swept[task] = sweep(task, arguments.episodes, arguments.calls)
+        write({"episodes": arguments.episodes, "tasks": swept})
 
 
 if __name__ == "__main__":
