@@ -17,6 +17,7 @@ from omegaconf.errors import MissingMandatoryValue
 
 from phihp_torchrl.deployment import Agent, AgentError, load_agent
 from phihp_torchrl.evaluation import evaluate, evaluation_seed, markdown_table, measure_latency
+from phihp_torchrl.ranges import check_not_negative, check_positive
 from phihp_torchrl.trainers import ConfigError, from_mapping, import_plugins, show_episode
 
 _ROWS = ("return_mean", "return_std", "return_min", "return_max", "length_mean", "latency_ms_mean",
@@ -41,12 +42,8 @@ class Config:
     def __post_init__(self) -> None:
         if self.planner not in (True, False, "both"):
             raise ValueError(f"planner: expected true, false or both, got {self.planner!r}.")
-        for name in ("episodes", "threads"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
-        for name in ("seed", "latency_actions"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
+        check_positive(self, "episodes", "threads")
+        check_not_negative(self, "seed", "latency_actions")
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="evaluate")

@@ -21,6 +21,7 @@ from phihp_torchrl.agents.functional import (
 from phihp_torchrl.agents.imagination import Imagination
 from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.ranges import check_not_negative, check_positive
 
 # Half of the actions are near the actor's, where actor and planner compare values; the others are
 # those of the replay, so that the critics also know what not to do.
@@ -53,12 +54,8 @@ class RefitConfig:
     learning_rate: float = 1e-3
 
     def __post_init__(self) -> None:
-        for name in ("transitions", "horizon", "steps", "batch_size", "learning_rate"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
-        for name in ("start", "interval"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
+        check_positive(self, "transitions", "horizon", "steps", "batch_size", "learning_rate")
+        check_not_negative(self, "start", "interval")
 
     def is_due(self, updates: int, total: int) -> bool:
         """Whether the critics are fitted after ``updates`` of ``total`` updates."""

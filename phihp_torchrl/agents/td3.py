@@ -24,6 +24,7 @@ from phihp_torchrl.agents.functional import (
 from phihp_torchrl.agents.networks import make_actor, make_qvalue
 from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.ranges import check_not_negative, check_positive, check_positive_share
 
 _logger = logging.getLogger(__name__)
 
@@ -61,21 +62,11 @@ class TD3Config:
     value_expansion: int = 1
 
     def __post_init__(self) -> None:
-        positive = (
-            "actor_learning_rate",
-            "critic_learning_rate",
-            "policy_delay",
-            "value_expansion",
+        check_positive(
+            self, "actor_learning_rate", "critic_learning_rate", "policy_delay", "value_expansion"
         )
-        for name in positive:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
-        for name in ("gamma", "tau"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected a number in (0, 1], got {getattr(self, name)}.")
-        for name in ("target_noise", "target_noise_clip", "last_layer_scale"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
+        check_positive_share(self, "gamma", "tau")
+        check_not_negative(self, "target_noise", "target_noise_clip", "last_layer_scale")
 
 
 def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:

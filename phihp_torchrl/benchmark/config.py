@@ -9,6 +9,7 @@ from pathlib import Path
 from phihp_torchrl.benchmark.cell import Cell, CellFiles
 from phihp_torchrl.evaluation import PUBLISHED_SAMPLES
 from phihp_torchrl.evaluation.seeds import check_training_seed
+from phihp_torchrl.ranges import check_not_negative, check_positive
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,8 @@ class BenchmarkConfig:
         check_training_seed(self.seed)
         if self.share is not None and not self.share > 0:
             raise ValueError(f"share: expected a positive number or null, got {self.share}.")
-        if self.jobs < 1:
-            raise ValueError(f"jobs: expected a positive number, got {self.jobs}.")
-        for name in ("claim_wait", "refresh"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
+        check_positive(self, "jobs")
+        check_not_negative(self, "claim_wait", "refresh")
         self.cell()
 
     @property

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.func import functional_call, jacrev, vmap
 
 from phihp_torchrl.dynamics.loss import DynamicsLoss
+from phihp_torchrl.ranges import check_positive
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,7 @@ class FitConfig:
             raise ValueError(
                 f"method: expected 'levenberg_marquardt' or 'adam', got {self.method!r}."
             )
-        for name in ("steps", "patience", "learning_rate", "initial_lambda", "final_lambda"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        check_positive(self, "steps", "patience", "learning_rate", "initial_lambda", "final_lambda")
         if self.batch_size is not None and self.batch_size < 1:
             raise ValueError(f"batch_size: expected a positive number, got {self.batch_size}.")
 

@@ -14,6 +14,7 @@ from phihp_torchrl.envs import LatentEnv, WorldModelEnv
 from phihp_torchrl.planners.cem import CEMPlanner
 from phihp_torchrl.planners.mppi import MPPIPlanner
 from phihp_torchrl.planners.settings import MPPISettings, PlanSettings
+from phihp_torchrl.ranges import check_not_negative
 
 
 @dataclass(frozen=True)
@@ -126,8 +127,7 @@ class MPPIConfig(MPPISettings):
                 f"initial_min_std: expected min_std={self.min_std} to init_std={self.init_std}, "
                 f"got {self.initial_min_std}."
             )
-        if self.schedule_steps < 0:
-            raise ValueError(f"schedule_steps: expected a number >= 0, got {self.schedule_steps}.")
+        check_not_negative(self, "schedule_steps")
 
     def at(self, real_steps: int) -> MPPISettings:
         """The settings after so many real steps."""

@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
 
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.planners.factory import PlannerConfig, make_planner
+from phihp_torchrl.ranges import check_not_negative, check_positive
 from phihp_torchrl.tasks import Task
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -45,10 +46,8 @@ class CollectConfig:
     exploration_reward: bool = True
 
     def __post_init__(self) -> None:
-        if not self.noise >= 0:
-            raise ValueError(f"noise: expected a number >= 0, got {self.noise}.")
-        if self.random_hold < 1:
-            raise ValueError(f"random_hold: expected a positive number, got {self.random_hold}.")
+        check_not_negative(self, "noise")
+        check_positive(self, "random_hold")
         PlannerConfig(**self.plan())  # refuses what the planner would refuse after real steps
 
     def plan(self) -> dict[str, Any]:

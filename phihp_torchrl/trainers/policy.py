@@ -28,6 +28,7 @@ from phihp_torchrl.agents import (
 )
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.envs import make_start_states
+from phihp_torchrl.ranges import check_not_negative, check_positive, check_share
 from phihp_torchrl.tasks import Task
 
 
@@ -89,7 +90,8 @@ class PolicyConfig:
     refit: RefitConfig = field(default_factory=RefitConfig)
 
     def __post_init__(self) -> None:
-        positive = (
+        check_positive(
+            self,
             "updates",
             "batch_size",
             "num_worlds",
@@ -99,15 +101,8 @@ class PolicyConfig:
             "evaluation_interval",
             "evaluation_episodes",
         )
-        for name in positive:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
-        for name in ("random_fraction", "decay"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected a number in [0, 1], got {getattr(self, name)}.")
-        for name in ("random_steps", "exploration_noise", "real_evaluation_episodes"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
+        check_share(self, "random_fraction", "decay")
+        check_not_negative(self, "random_steps", "exploration_noise", "real_evaluation_episodes")
         for name in ("max_age", "evaluation_steps", "max_seconds"):
             value = getattr(self, name)
             if value is not None and not value > 0:

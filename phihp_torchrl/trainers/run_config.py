@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from phihp_torchrl.evaluation.seeds import check_training_seed
 from phihp_torchrl.planners.factory import PlannerConfig
+from phihp_torchrl.ranges import check_not_negative, check_positive
 from phihp_torchrl.tasks import get_task
 from phihp_torchrl.trainers.config import ConfigError, from_mapping
 from phihp_torchrl.trainers.loggers import LoggerConfig
@@ -52,12 +53,8 @@ class EvaluateConfig:
     video: bool = True
 
     def __post_init__(self) -> None:
-        if self.episodes < 1:
-            raise ValueError(f"episodes: expected a positive number, got {self.episodes}.")
-        if self.latency_actions < 0:
-            raise ValueError(
-                f"latency_actions: expected a number >= 0, got {self.latency_actions}."
-            )
+        check_positive(self, "episodes")
+        check_not_negative(self, "latency_actions")
 
 
 @dataclass(frozen=True)
@@ -110,9 +107,7 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         check_training_seed(self.seed)
-        for name in ("keep_checkpoints", "threads"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        check_positive(self, "keep_checkpoints", "threads")
         if not self.checkpoint_interval >= 0:
             raise ValueError(
                 f"checkpoint_interval: expected seconds >= 0, got {self.checkpoint_interval}."

@@ -24,6 +24,7 @@ from phihp_torchrl.agents import (
     make_td3_loss,
 )
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
+from phihp_torchrl.ranges import check_not_negative, check_positive, check_share
 from phihp_torchrl.tasks import Task
 
 
@@ -57,7 +58,8 @@ class RealTD3Config(TD3Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        positive = (
+        check_positive(
+            self,
             "real_steps",
             "batch_size",
             "replay_capacity",
@@ -65,20 +67,14 @@ class RealTD3Config(TD3Config):
             "evaluation_interval",
             "evaluation_episodes",
         )
-        for name in positive:
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
-        for name in ("random_steps", "exploration_noise"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
+        check_not_negative(self, "random_steps", "exploration_noise")
         most = min(self.replay_capacity, self.real_steps)
         if self.random_steps > most:
             raise ValueError(
                 f"random_steps: expected at most {most}, the lesser of replay_capacity and "
                 f"real_steps, got {self.random_steps}."
             )
-        if not 0 <= self.decay <= 1:
-            raise ValueError(f"decay: expected a number in [0, 1], got {self.decay}.")
+        check_share(self, "decay")
         if self.value_expansion != 1:
             raise ValueError(
                 "value_expansion: expected 1, for there is no model to carry on with, "

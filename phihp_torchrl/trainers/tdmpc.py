@@ -17,6 +17,7 @@ from phihp_torchrl.agents.tdmpc import TOLD, EpisodeReplay, TDMPCConfig, TDMPCUp
 from phihp_torchrl.deployment.tdmpc import TDMPCAgent
 from phihp_torchrl.evaluation import evaluate
 from phihp_torchrl.planners.factory import MPPIConfig, make_latent_planner
+from phihp_torchrl.ranges import check_not_negative, check_positive, check_share
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.collect import CollectConfig, Policy, make_real_env, random_policy
 
@@ -60,18 +61,12 @@ class TDMPCTrainConfig:
     planner: MPPIConfig = field(default_factory=MPPIConfig)
 
     def __post_init__(self) -> None:
-        for name in ("real_steps", "horizon", "batch_size", "evaluation_interval"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
-        for name in ("seed_steps", "priority_alpha", "priority_beta", "evaluation_episodes"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
-        if not self.updates_per_step > 0:
-            raise ValueError(
-                f"updates_per_step: expected a positive number, got {self.updates_per_step}."
-            )
-        if not 0 <= self.decay <= 1:
-            raise ValueError(f"decay: expected a number in [0, 1], got {self.decay}.")
+        check_positive(self, "real_steps", "horizon", "batch_size", "evaluation_interval")
+        check_not_negative(
+            self, "seed_steps", "priority_alpha", "priority_beta", "evaluation_episodes"
+        )
+        check_positive(self, "updates_per_step")
+        check_share(self, "decay")
         if self.replay_capacity < 2 * self.horizon:
             raise ValueError(
                 f"replay_capacity: expected at least two slices of horizon={self.horizon}, "

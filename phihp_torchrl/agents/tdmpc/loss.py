@@ -22,6 +22,7 @@ from phihp_torchrl.agents.tdmpc.losses import (
 )
 from phihp_torchrl.agents.tdmpc.told import TOLD
 from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.ranges import check_not_negative, check_positive_share
 
 _NOISE_CLIP = 0.3
 """Where the published runs clip the noise on the policy's actions, in units of the bounds."""
@@ -54,13 +55,11 @@ class TDMPCLossConfig:
     output_penalty: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("gamma", "rho"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected a number in (0, 1], got {getattr(self, name)}.")
+        check_positive_share(self, "gamma", "rho")
         coefficients = [f"{name}_coef" for name in ("consistency", "reward", "value")]
-        for name in (*coefficients, "termination_coef", "policy_noise", "output_penalty"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}.")
+        check_not_negative(
+            self, *coefficients, "termination_coef", "policy_noise", "output_penalty"
+        )
 
 
 class TDMPCLoss(LossModule):

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torchrl.modules import MLP
 
+from phihp_torchrl.ranges import check_positive
 from phihp_torchrl.tasks import Task
 
 
@@ -28,9 +29,7 @@ class TOLDConfig:
     mlp_dim: int = 512
 
     def __post_init__(self) -> None:
-        for name in ("latent_dim", "encoder_dim", "mlp_dim"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        check_positive(self, "latent_dim", "encoder_dim", "mlp_dim")
 
 
 class TOLD(nn.Module):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from phihp_torchrl.agents.tdmpc.loss import TDMPCLoss, TDMPCLossConfig
 from phihp_torchrl.agents.tdmpc.told import TOLD, TOLDConfig
+from phihp_torchrl.ranges import check_positive, check_positive_share
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,10 @@ class TDMPCConfig:
     loss: TDMPCLossConfig = field(default_factory=TDMPCLossConfig)
 
     def __post_init__(self) -> None:
-        for name in ("learning_rate", "critic_learning_rate", "max_grad_norm", "target_interval"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}.")
-        if not 0 < self.tau <= 1:
-            raise ValueError(f"tau: expected a number in (0, 1], got {self.tau}.")
+        check_positive(
+            self, "learning_rate", "critic_learning_rate", "max_grad_norm", "target_interval"
+        )
+        check_positive_share(self, "tau")
 
 
 class TDMPCUpdate:
