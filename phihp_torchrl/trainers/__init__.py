@@ -8,7 +8,8 @@ from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
 from phihp_torchrl.trainers.methods import METHODS, Method, get_method, register_method
 from phihp_torchrl.trainers.model import ModelConfig, ModelTrainer, make_dynamics
 from phihp_torchrl.trainers.phases import read_result
-from phihp_torchrl.trainers.policy import PolicyConfig, PolicyTrainer, StartConfig
+from phihp_torchrl.trainers.policy import PolicyTrainer
+from phihp_torchrl.trainers.policy_config import PolicyConfig, StartConfig
 from phihp_torchrl.trainers.run import RunResult, run
 from phihp_torchrl.trainers.run_config import (
     EvaluateConfig,

@@ -22,7 +22,7 @@ from phihp_torchrl.trainers.config import ConfigError, from_mapping
 from phihp_torchrl.trainers.loggers import LoggerConfig
 from phihp_torchrl.trainers.methods import Method, get_method
 from phihp_torchrl.trainers.model import ModelConfig
-from phihp_torchrl.trainers.policy import PolicyConfig
+from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.trainers.td3 import RealTD3Config
 from phihp_torchrl.trainers.tdmpc import TDMPCTrainConfig
