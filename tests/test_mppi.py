@@ -7,6 +7,7 @@ from math import exp, inf, nan, sqrt
 
 import pytest
 import torch
+from points import ZEROS, Point, bounds, half_way, point_problem
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import check_env_specs
@@ -15,48 +16,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from phihp_torchrl import HybridDynamics, WorldModelEnv, get_task
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.envs import LatentEnv
-from phihp_torchrl.planners import (
-    ActionBounds,
-    MPPINoise,
-    MPPIPlanner,
-    MPPISettings,
-    Problem,
-    mppi_plan,
-)
+from phihp_torchrl.planners import MPPINoise, MPPIPlanner, MPPISettings, mppi_plan
 from phihp_torchrl.planners.factory import MPPIConfig
 from phihp_torchrl.planners.mppi_core import elite_weights
 
 torch.set_num_threads(1)
-
-
-class Point:
-    """A point on a plane that moves by its action and wants to be at ``goal``."""
-
-    def __init__(self, goal=0.3, wall=inf, reward=None):
-        self.goal, self.wall, self.reward = goal, wall, reward
-
-    def locate(self, observation):
-        return observation
-
-    def observe(self, state):
-        return state
-
-    def transition(self, state, action):
-        next_state = state + action
-        reward = -(next_state - self.goal).square().sum(-1)
-        if self.reward is not None:
-            reward = self.reward(state, action, reward)
-        return next_state, reward, (next_state.abs() > self.wall).any(-1)
-
-
-def half_way(observation):
-    return 0.5 * (0.3 - observation)
-
-
-def problem(actor=None, value=None, low=(-1.0, -0.5), high=(1.0, 0.75), **kwargs):
-    low, high = (torch.tensor(t, dtype=torch.float64) for t in (low, high))
-    bounds = ActionBounds.from_limits(low, high)
-    return Problem(model=Point(**kwargs), bounds=bounds, actor=actor, value=value)
 
 
 def settings(**kwargs):
@@ -88,10 +52,7 @@ def draw(s, batch=(), seed=0, action_dim=2):
 
 def plan(state, noise, s, mean=None, **kwargs):
     min_std = torch.tensor(s.min_std, dtype=torch.float64)
-    return mppi_plan(state, noise, mean, min_std, problem=problem(**kwargs), settings=s)
-
-
-ZEROS = torch.zeros(2, dtype=torch.float64)
+    return mppi_plan(state, noise, mean, min_std, problem=point_problem(**kwargs), settings=s)
 
 
 # By hand.
@@ -125,7 +86,7 @@ def one_step(momentum=0.0, min_std=0.0, select="mean", choice=((0.5,), (0.5,)), 
     noise = MPPINoise(samples, samples[0, :, :0], choice)
     state = torch.zeros(rows, 1, dtype=torch.float64)
     mean = torch.full((rows, 1, 1), mean, dtype=torch.float64)
-    return plan(state, noise, s, mean, low=(-1.0,), high=(1.0,))
+    return plan(state, noise, s, mean, limits=bounds((-1.0,), (1.0,)))
 
 
 # Goal 0.3: the scores are 0 and -0.16, so the weights 1 and e^(-0.32), normalised.
@@ -168,7 +129,7 @@ def test_more_budget_is_no_worse_on_a_quadratic():
     def score(**kwargs):
         s = settings(**kwargs)
         actions = plan(state, draw(s, (50,)), s).actions
-        p, total, now = problem(), 0.0, state
+        p, total, now = point_problem(), 0.0, state
         for k in range(4):
             now, reward, _ = p.model.transition(now, actions[:, k])
             total = total + 0.99**k * reward

@@ -9,6 +9,7 @@ from math import inf, nan
 
 import pytest
 import torch
+from points import ZEROS, Point, bounds, half_way, point_problem
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
@@ -38,34 +39,6 @@ torch.set_num_threads(1)
 TASKS = ["pendulum-swingup", "cartpole", "acrobot", "acrobot-swingup"]
 
 
-class Point:
-    """A point on a plane that moves by its action and wants to be at ``goal``."""
-
-    def __init__(self, goal=0.3, wall=inf, reward=None):
-        self.goal, self.wall, self.reward = goal, wall, reward
-
-    def locate(self, observation):
-        return observation
-
-    def observe(self, state):
-        return state
-
-    def transition(self, state, action):
-        next_state = state + action
-        reward = -(next_state - self.goal).square().sum(-1)
-        if self.reward is not None:
-            reward = self.reward(state, action, reward)
-        return next_state, reward, (next_state.abs() > self.wall).any(-1)
-
-
-def bounds(low=(-1.0, -0.5), high=(1.0, 0.75), dtype=torch.float64):
-    return ActionBounds.from_limits(torch.tensor(low, dtype=dtype), torch.tensor(high, dtype=dtype))
-
-
-def point_problem(actor=None, value=None, **kwargs):
-    return Problem(model=Point(**kwargs), bounds=bounds(), actor=actor, value=value)
-
-
 def settings(**kwargs):
     defaults = {"planning_horizon": 4, "optim_steps": 3, "num_candidates": 40, "top_k": 6}
     return PlanSettings(**{**defaults, **kwargs})
@@ -77,15 +50,10 @@ def draw(settings, batch=(), seed=0, action_dim=2):
     return torch.randn(shape, generator=generator, dtype=torch.float64)
 
 
-def half_way(observation):
-    return 0.5 * (0.3 - observation)
-
-
 def flat_value(observation, action):
     return -observation.square().sum(-1) - action.square().sum(-1)
 
 
-ZEROS = torch.zeros(2, dtype=torch.float64)
 VARIANTS = [
     {},
     {"num_policy_candidates": 10},
