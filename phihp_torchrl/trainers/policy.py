@@ -15,21 +15,19 @@ from phihp_torchrl.agents import (
     CriticRefit,
     FlatReplay,
     Imagination,
-    TD3Update,
     Worlds,
     copy_actor,
     copy_twin_qvalue,
-    draw_noise,
     learning_rate_scale,
-    make_td3_loss,
 )
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.envs import make_start_states
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.policy_config import PolicyConfig
+from phihp_torchrl.trainers.td3_base import TD3Trainer
 
 
-class PolicyTrainer:
+class PolicyTrainer(TD3Trainer):
     """Learns actor and critics from imagined transitions, many worlds at once.
 
     After every ``evaluation_interval`` updates the noise-free actor plays episodes from the task's
@@ -70,13 +68,10 @@ class PolicyTrainer:
         data_states: Tensor | None = None,
         compile: bool = False,
     ) -> None:
-        self.task = task
-        self.config = config
         self.world_model = TaskWorldModel(task, dynamics)
-        self.generator = torch.Generator().manual_seed(seed)
+        super().__init__(self.world_model, config.td3, seed=seed, compile=compile)
+        self.config = config
         self.start_states = make_start_states(task, **vars(config.start), states=data_states)
-        self.loss = make_td3_loss(self.world_model, config.td3)
-        self.update = TD3Update(self.loss, self.world_model, config.td3, compile=compile)
         self.imagination = Imagination(
             self.world_model, self.loss.max_action, self.max_age, compile=compile
         )
@@ -89,8 +84,6 @@ class PolicyTrainer:
         self.worlds = self._new_worlds()
         self.best = [layer.clone() for layer in (*self.update.actor, *self.update.critics)]
         self.best_return = -math.inf
-        self.updates = 0
-        self.seconds = 0.0
         self._evaluation_states = task.reset.sample(
             [config.evaluation_episodes], generator=self.generator
         )
@@ -134,7 +127,9 @@ class PolicyTrainer:
                 self._imagine_chunk()
             for _ in range(min(round_end - self.updates % round_end, until - self.updates)):
                 if self.updates % config.td3.policy_delay == 0:
-                    losses = self._learn()
+                    left = 1.0 - self.updates / config.updates
+                    scale = learning_rate_scale(left, config.decay)
+                    losses = self._learn(config.batch_size, scale)
                 self.updates += 1
         imagined = self._play(self.imagination, self._evaluation_states)
         # Of equal ones the later, which has learned more; none that left the finite numbers.
@@ -174,31 +169,21 @@ class PolicyTrainer:
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
         return {
-            "update": self.update.state_dict(),
-            "replay": self.replay.state_dict(),
-            "worlds": list(self.worlds),
+            **super().state_dict(),
             "best": list(self.best),
             "best_return": self.best_return,
-            "updates": self.updates,
-            "seconds": self.seconds,
             "evaluation_states": self._evaluation_states,
             "world_states": self._world_states,
-            "generator": self.generator.get_state(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from :meth:`state_dict`."""
-        self.update.load_state_dict(state["update"])
-        self.replay.load_state_dict(state["replay"])
-        self.worlds = Worlds(*state["worlds"])
+        super().load_state_dict(state)
         for kept, layer in zip(self.best, state["best"], strict=True):
             kept.copy_(layer)
         self.best_return = state["best_return"]
-        self.updates = state["updates"]
-        self.seconds = state["seconds"]
         self._evaluation_states = state["evaluation_states"]
         self._world_states = state["world_states"]
-        self.generator.set_state(state["generator"])
 
     def _play(self, world: Imagination, states: Tensor) -> float:
         """Mean return of the noise-free actor; minus infinity where it left the finite numbers."""
@@ -236,23 +221,11 @@ class PolicyTrainer:
         config = self.config
         while True:
             warm = len(self.replay) >= config.random_steps
-            noise = draw_noise(
+            self._act(
+                self.imagination,
                 self.start_states.sample([config.chunk_steps, config.num_worlds], self.generator),
-                self.loss.max_action,
-                std=config.exploration_noise,
+                noise=config.exploration_noise,
                 random_fraction=config.random_fraction if warm else 1.0,
-                generator=self.generator,
             )
-            batch, self.worlds = self.imagination.chunk(
-                self.update.networks.actor, self.worlds, noise
-            )
-            self.replay.extend(batch)
             if warm:
                 return
-
-    def _learn(self) -> dict[str, Tensor]:
-        config = self.config
-        left = 1.0 - self.updates / config.updates
-        scale = learning_rate_scale(left, config.decay)
-        batch = self.replay.sample(config.batch_size * config.td3.policy_delay, self.generator)
-        return self.update(batch, scale, self.generator)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,17 +14,15 @@ from phihp_torchrl.agents import (
     FlatReplay,
     Imagination,
     TD3Config,
-    TD3Update,
     Worlds,
     copy_actor,
     copy_twin_qvalue,
-    draw_noise,
     learning_rate_scale,
-    make_td3_loss,
 )
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.ranges import check_not_negative, check_positive, check_share
 from phihp_torchrl.tasks import Task
+from phihp_torchrl.trainers.td3_base import TD3Trainer
 
 
 @dataclass(frozen=True)
@@ -93,7 +90,7 @@ class RealTD3Config(TD3Config):
         return self.steps_per_update * self.policy_delay
 
 
-class RealTD3Trainer:
+class RealTD3Trainer(TD3Trainer):
     """Learns actor and critics from one real world, step by step.
 
     The world is stepped on its tensors, by the function that steps imagined worlds; here it steps
@@ -128,12 +125,9 @@ class RealTD3Trainer:
         transitions: Batch | None = None,
         compile: bool = False,
     ) -> None:
-        self.task = task
-        self.config = config
         world = TaskWorldModel(task, HybridDynamics.oracle(task))
-        self.generator = torch.Generator().manual_seed(seed)
-        self.loss = make_td3_loss(world, config)
-        self.update = TD3Update(self.loss, world, config, compile=compile)
+        super().__init__(world, config, seed=seed, compile=compile)
+        self.config = config
         # What imagined worlds are stepped with; this one is no imagination, it is the true one.
         self.world = Imagination(world, self.loss.max_action, task.max_steps, compile=compile)
         given = 0 if transitions is None else len(transitions.reward)
@@ -144,8 +138,6 @@ class RealTD3Trainer:
         self.given = given
         first = task.reset.sample([1], generator=self.generator)
         self.worlds = Worlds(first, torch.zeros(1, dtype=torch.int64))
-        self.updates = 0
-        self.seconds = 0.0
         # Evaluations have a generator of their own: the log has no part in the training.
         self._evaluation_states = task.reset.sample(
             [config.evaluation_episodes], generator=torch.Generator().manual_seed(seed)
@@ -170,13 +162,22 @@ class RealTD3Trainer:
     def advance(self) -> dict[str, float]:
         """Train for one evaluation interval and evaluate; returns what to log."""
         start = time.perf_counter()
-        until = min(self.real_steps + self.config.evaluation_interval, self.config.real_steps)
+        config = self.config
+        until = min(self.real_steps + config.evaluation_interval, config.real_steps)
         losses: dict[str, Tensor] = {}
         while self.real_steps < until:
-            warm = len(self.replay) >= self.config.random_steps
-            self._act(warm)
+            warm = len(self.replay) >= config.random_steps
+            self._act(
+                self.world,
+                self.task.reset.sample([config.round_steps, 1], generator=self.generator),
+                noise=config.exploration_noise,
+                random_fraction=0.0 if warm else 1.0,
+            )
             if warm:
-                losses = self._learn()
+                left = 1.0 - self.real_steps / config.real_steps
+                scale = learning_rate_scale(left, config.decay)
+                losses = self._learn(config.batch_size, scale)
+                self.updates += config.policy_delay
         returns = self.evaluate()
         self.seconds += time.perf_counter() - start
         return {
@@ -198,45 +199,3 @@ class RealTD3Trainer:
             "actor": copy_actor(self.task, self.update.actor),
             "qvalue": copy_twin_qvalue(self.task, self.update.critics),
         }
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that a resumed run needs, tensors and numbers only."""
-        return {
-            "update": self.update.state_dict(),
-            "replay": self.replay.state_dict(),
-            "worlds": list(self.worlds),
-            "updates": self.updates,
-            "seconds": self.seconds,
-            "generator": self.generator.get_state(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
-        self.update.load_state_dict(state["update"])
-        self.replay.load_state_dict(state["replay"])
-        self.worlds = Worlds(*state["worlds"])
-        self.updates = state["updates"]
-        self.seconds = state["seconds"]
-        self.generator.set_state(state["generator"])
-
-    def _act(self, warm: bool) -> None:
-        """Take the real steps of one round."""
-        starts = self.task.reset.sample([self.config.round_steps, 1], generator=self.generator)
-        noise = draw_noise(
-            starts,
-            self.loss.max_action,
-            std=self.config.exploration_noise,
-            random_fraction=0.0 if warm else 1.0,
-            generator=self.generator,
-        )
-        batch, self.worlds = self.world.chunk(self.update.networks.actor, self.worlds, noise)
-        self.replay.extend(batch)
-
-    def _learn(self) -> dict[str, Tensor]:
-        """One round of updates."""
-        config = self.config
-        left = 1.0 - self.real_steps / config.real_steps
-        scale = learning_rate_scale(left, config.decay)
-        batch = self.replay.sample(config.batch_size * config.policy_delay, self.generator)
-        self.updates += config.policy_delay
-        return self.update(batch, scale, self.generator)

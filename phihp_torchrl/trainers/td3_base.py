@@ -1,0 +1,93 @@
+"""What TD3 does in any world, imagined or real: act into a replay, learn from it, be resumed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.agents import (
+    FlatReplay,
+    Imagination,
+    TD3Config,
+    TD3Update,
+    Worlds,
+    draw_noise,
+    make_td3_loss,
+)
+from phihp_torchrl.dynamics import TaskWorldModel
+
+
+class TD3Trainer:
+    """The base of the trainers by TD3, which say when to act and when to learn.
+
+    Args:
+        world_model: the world to learn in, imagined or real.
+        td3: TD3's own hyper-parameters.
+        seed: of everything random here but the networks' initial weights, which come from torch's
+            global generator.
+        compile: whether to compile the update.
+    """
+
+    replay: FlatReplay
+    worlds: Worlds
+
+    def __init__(
+        self, world_model: TaskWorldModel, td3: TD3Config, *, seed: int, compile: bool
+    ) -> None:
+        self.task = world_model.task
+        self.generator = torch.Generator().manual_seed(seed)
+        self.loss = make_td3_loss(world_model, td3)
+        self.update = TD3Update(self.loss, world_model, td3, compile=compile)
+        self.updates = 0
+        self.seconds = 0.0
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a resumed run needs, tensors and numbers only."""
+        return {
+            "update": self.update.state_dict(),
+            "replay": self.replay.state_dict(),
+            "worlds": list(self.worlds),
+            "updates": self.updates,
+            "seconds": self.seconds,
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from :meth:`state_dict`."""
+        self.update.load_state_dict(state["update"])
+        self.replay.load_state_dict(state["replay"])
+        self.worlds = Worlds(*state["worlds"])
+        self.updates = state["updates"]
+        self.seconds = state["seconds"]
+        self.generator.set_state(state["generator"])
+
+    def _act(
+        self, world: Imagination, starts: Tensor, *, noise: float, random_fraction: float
+    ) -> None:
+        """Step the worlds with noise on the actor's actions.
+
+        Args:
+            world: steps them.
+            starts: where lives that begin meanwhile start, ``[steps, worlds, n]``.
+            noise: std of the noise, in units of the action bounds.
+            random_fraction: share of actions that are uniformly random.
+        """
+        drawn = draw_noise(
+            starts,
+            self.loss.max_action,
+            std=noise,
+            random_fraction=random_fraction,
+            generator=self.generator,
+        )
+        batch, self.worlds = world.chunk(self.update.networks.actor, self.worlds, drawn)
+        self.replay.extend(batch)
+
+    def _learn(self, batch_size: int, learning_rate_scale: float) -> dict[str, Tensor]:
+        """A round of updates, the critics' on ``batch_size`` transitions each."""
+        rows = batch_size * self.update.config.policy_delay
+        return self.update(
+            self.replay.sample(rows, self.generator), learning_rate_scale, self.generator
+        )
