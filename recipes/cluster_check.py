@@ -27,21 +27,17 @@ from phihp_torchrl.report import ReportConfig, make_report
 TASKS, SEEDS, SHARE = ("pendulum", "cartpole"), range(6), 0.05
 CELLS = len(TASKS) * len(SEEDS)
 
-# A few seconds a cell, in many units of work with a checkpoint after each.
-SMALL = (
+# The least that the phases can do; the tests of the other recipes take it too.
+TINY = (
     "compile=false",
-    "checkpoint_interval=0",
-    "evaluate.video=false",
     "evaluate.episodes=2",
     "evaluate.latency_actions=3",
-    "model.steps_per_iteration=50",
     "model.fit.steps=2",
     "model.collect.planning_horizon=3",
     "model.collect.replan_every=2",
     "model.collect.num_candidates=8",
     "model.collect.top_k=2",
     "model.collect.optim_steps=1",
-    "policy.updates=160",
     "policy.batch_size=8",
     "policy.num_worlds=4",
     "policy.chunk_steps=2",
@@ -59,6 +55,15 @@ SMALL = (
     "planner.num_candidates=8",
     "planner.num_policy_candidates=2",
     "planner.top_k=2",
+)
+
+# A few seconds a cell, in many units of work with a checkpoint after each.
+SMALL = (
+    *TINY,
+    "checkpoint_interval=0",
+    "evaluate.video=false",
+    "model.steps_per_iteration=50",
+    "policy.updates=160",
 )
 
 

@@ -15,37 +15,20 @@ from phihp_torchrl.deployment import load_agent
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 SMALL = (
+    *runpy.run_path(str(RECIPES / "cluster_check.py"))["TINY"],
     "progress=false",
-    "compile=false",
     "model.real_steps=60",
     "model.steps_per_iteration=30",
-    "model.fit.steps=2",
-    "model.collect.planning_horizon=3",
-    "model.collect.replan_every=2",
-    "model.collect.num_candidates=8",
-    "model.collect.top_k=2",
-    "model.collect.optim_steps=1",
     "policy.updates=8",
-    "policy.batch_size=8",
-    "policy.num_worlds=4",
-    "policy.chunk_steps=2",
-    "policy.updates_per_step=2",
-    "policy.replay_capacity=200",
-    "policy.random_steps=16",
-    "policy.evaluation_interval=4",
-    "policy.evaluation_episodes=2",
-    "policy.evaluation_steps=20",
-    "policy.td3.actor_hidden_sizes=[8]",
-    "policy.td3.critic_hidden_sizes=[8]",
-    "planner.planning_horizon=2",
-    "planner.replan_every=2",
-    "planner.optim_steps=1",
-    "planner.num_candidates=8",
-    "planner.num_policy_candidates=2",
-    "planner.top_k=2",
+)
+# A run that ends as soon as it has learned, and an evaluation of its agent.
+BRIEF = (
+    "progress=false",
     "evaluate.episodes=2",
     "evaluate.latency_actions=3",
+    "evaluate.video=false",
 )
+EVALUATE = ("evaluate", "agent=run/agent", "episodes=2", "latency_actions=3", "video=false")
 
 Recipe = Callable[..., None]
 
@@ -107,7 +90,7 @@ def test_td3_then_resume_then_evaluate(
     recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = (
-        "progress=false",
+        *BRIEF,
         "compile=false",
         "td3.real_steps=40",
         "td3.random_steps=20",
@@ -115,9 +98,6 @@ def test_td3_then_resume_then_evaluate(
         "td3.evaluation_episodes=2",
         "td3.actor_hidden_sizes=[8]",
         "td3.critic_hidden_sizes=[8]",
-        "evaluate.episodes=2",
-        "evaluate.latency_actions=3",
-        "evaluate.video=false",
     )
     recipe("td3", "task=cartpole", "run_dir=run", *small)
     assert "| cartpole | 1 | 40 | – |" in capsys.readouterr().out
@@ -125,7 +105,7 @@ def test_td3_then_resume_then_evaluate(
     header, *rows = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
     assert header.startswith("phase,unit,real_steps,seconds,return_mean,return_std")
     assert [row.split(",")[2] for row in rows[:2]] == ["20", "40"]
-    recipe("evaluate", "agent=run/agent", "episodes=2", "latency_actions=3", "video=false")
+    recipe(*EVALUATE)
     assert "| cartpole | actor |" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="expected an agent that plans"):
         recipe("evaluate", "agent=run/agent", "planner=true")
@@ -137,7 +117,7 @@ def test_tdmpc_then_resume_then_evaluate(
 ) -> None:
     small = (
         "preset=default",
-        "progress=false",
+        *BRIEF,
         "compile=false",
         "tdmpc.real_steps=60",
         "tdmpc.seed_steps=20",
@@ -147,16 +127,13 @@ def test_tdmpc_then_resume_then_evaluate(
         "tdmpc.evaluation_episodes=2",
         "tdmpc.learn.told.mlp_dim=8",
         "tdmpc.planner.num_candidates=16",
-        "evaluate.episodes=2",
-        "evaluate.latency_actions=3",
-        "evaluate.video=false",
     )
     recipe("tdmpc", "task=cartpole", "run_dir=run", *small)
     assert "| cartpole | 1 | 60 |" in capsys.readouterr().out
     recipe("tdmpc", "resume=run")
     header = (tmp_path / "run" / "metrics.csv").read_text().splitlines()[0]
     assert {"return_mean", "return_std", "tdmpc/td_error"} <= set(header.split(","))
-    recipe("evaluate", "agent=run/agent", "episodes=2", "latency_actions=3", "video=false")
+    recipe(*EVALUATE)
     assert "| cartpole | planner | actor |" in capsys.readouterr().out
 
 
@@ -164,11 +141,9 @@ def test_tdmpc_then_resume_then_evaluate(
 def test_cem_then_evaluate(
     recipe: Recipe, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = ("progress=false", "planner.num_candidates=30", "evaluate.episodes=2")
-    small = (*small, "evaluate.latency_actions=3", "evaluate.video=false")
-    recipe("cem", "task=pendulum", "run_dir=run", *small)
+    recipe("cem", "task=pendulum", "run_dir=run", "planner.num_candidates=30", *BRIEF)
     assert "| pendulum | 1 | 0 |" in capsys.readouterr().out
-    recipe("evaluate", "agent=run/agent", "episodes=2", "latency_actions=3", "video=false")
+    recipe(*EVALUATE)
     assert "| pendulum | planner |" in capsys.readouterr().out
 
 
