@@ -21,6 +21,9 @@ def recipe(tmp_path, monkeypatch):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.setattr(module, "RESULTS", tmp_path)
+    # What a recipe sets for its process must not reach the tests after it.
+    monkeypatch.setattr(module.torch, "set_flush_denormal", lambda mode: True)
+    monkeypatch.setattr(module.torch, "set_num_threads", lambda number: None)
     return module
 
 
