@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 
 def check_positive(config: object, *names: str) -> None:
-    """Refuse a field that is not above 0; NaN is not.
+    """Refuse a field that is not above 0, NaN included.
 
     Raises:
         ValueError: for the first such field, beginning with its name.
@@ -21,8 +21,24 @@ def check_positive(config: object, *names: str) -> None:
     _check(config, names, "a positive number", lambda value: value > 0)
 
 
+def check_count(config: object, *names: str) -> None:
+    """Refuse a field that is not 1 or above: a number of things, of which there must be one.
+
+    Raises:
+        ValueError: for the first such field, beginning with its name.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> check_count(SimpleNamespace(episodes=0.5), "episodes")
+        Traceback (most recent call last):
+        ...
+        ValueError: episodes: expected a positive number, got 0.5.
+    """
+    _check(config, names, "a positive number", lambda value: value >= 1)
+
+
 def check_not_negative(config: object, *names: str) -> None:
-    """Refuse a field that is not 0 or above; NaN is not.
+    """Refuse a field that is not 0 or above, NaN included.
 
     Raises:
         ValueError: for the first such field, beginning with its name.

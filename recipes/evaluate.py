@@ -17,7 +17,7 @@ from omegaconf.errors import MissingMandatoryValue
 
 from phihp_torchrl.deployment import Agent, AgentError, load_agent
 from phihp_torchrl.evaluation import evaluate, evaluation_seed, markdown_table, measure_latency
-from phihp_torchrl.ranges import check_not_negative, check_positive
+from phihp_torchrl.ranges import check_count, check_not_negative
 from phihp_torchrl.trainers import ConfigError, from_mapping, import_plugins, show_episode
 
 _ROWS = ("return_mean", "return_std", "return_min", "return_max", "length_mean", "latency_ms_mean",
@@ -42,7 +42,7 @@ class Config:
     def __post_init__(self) -> None:
         if self.planner not in (True, False, "both"):
             raise ValueError(f"planner: expected true, false or both, got {self.planner!r}.")
-        check_positive(self, "episodes", "threads")
+        check_count(self, "episodes", "threads")
         check_not_negative(self, "seed", "latency_actions")
 
 

@@ -23,7 +23,7 @@ from omegaconf.errors import MissingMandatoryValue
 from phihp_torchrl.deployment import Agent, AgentError, load_agent
 from phihp_torchrl.evaluation import evaluate, measure_latency
 from phihp_torchrl.planners.factory import PlannerConfig
-from phihp_torchrl.ranges import check_positive
+from phihp_torchrl.ranges import check_count
 from phihp_torchrl.report import Trial, write_trials
 from phihp_torchrl.trainers import ConfigError, from_mapping, import_plugins
 
@@ -43,7 +43,7 @@ class Config:
     plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_positive(self, "episodes", "latency_actions")
+        check_count(self, "episodes", "latency_actions")
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="sensitivity")

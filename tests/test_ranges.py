@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from phihp_torchrl.ranges import (
+    check_count,
     check_not_negative,
     check_positive,
     check_positive_share,
@@ -22,6 +23,7 @@ TINY = 1e-300  # not a subnormal: torch may flush those to zero
     ("check", "expected", "good", "bad"),
     [
         (check_positive, "a positive number", (1, TINY, inf), (0, 0.0, -1, -inf, nan)),
+        (check_count, "a positive number", (1, 2, 1.5, inf), (0, 0.5, -1, -inf, nan)),
         (check_not_negative, "a number >= 0", (0, 0.0, 1, inf), (-1, -TINY, -inf, nan)),
         (check_share, "a number in [0, 1]", (0, TINY, 0.5, 1), (-TINY, 1.01, 2, inf, nan)),
         (check_positive_share, "a number in (0, 1]", (TINY, 0.5, 1), (0, -TINY, 1.01, inf, nan)),

@@ -9,7 +9,7 @@ from pathlib import Path
 from phihp_torchrl.benchmark.cell import Cell, CellFiles
 from phihp_torchrl.evaluation import PUBLISHED_SAMPLES
 from phihp_torchrl.evaluation.seeds import check_training_seed
-from phihp_torchrl.ranges import check_not_negative, check_positive
+from phihp_torchrl.ranges import check_count, check_not_negative
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class BenchmarkConfig:
         check_training_seed(self.seed)
         if self.share is not None and not self.share > 0:
             raise ValueError(f"share: expected a positive number or null, got {self.share}.")
-        check_positive(self, "jobs")
+        check_count(self, "jobs")
         check_not_negative(self, "claim_wait", "refresh")
         self.cell()
 

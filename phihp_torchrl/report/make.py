@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from phihp_torchrl.ranges import check_positive
+from phihp_torchrl.ranges import check_count
 from phihp_torchrl.report.ablation import ablation
 from phihp_torchrl.report.acting import acting_section
 from phihp_torchrl.report.aggregate import aggregate_section
@@ -51,7 +51,7 @@ class ReportConfig:
     page: str | None = "README.md"
 
     def __post_init__(self) -> None:
-        check_positive(self, "reps")
+        check_count(self, "reps")
 
 
 @dataclass(frozen=True)

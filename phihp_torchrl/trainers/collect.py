@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
 
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.planners.factory import PlannerConfig, make_planner
-from phihp_torchrl.ranges import check_not_negative, check_positive
+from phihp_torchrl.ranges import check_count, check_not_negative
 from phihp_torchrl.tasks import Task
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -47,7 +47,7 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         check_not_negative(self, "noise")
-        check_positive(self, "random_hold")
+        check_count(self, "random_hold")
         PlannerConfig(**self.plan())  # refuses what the planner would refuse after real steps
 
     def plan(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from phihp_torchrl.agents import RefitConfig, TD3Config
-from phihp_torchrl.ranges import check_not_negative, check_positive, check_share
+from phihp_torchrl.ranges import check_count, check_not_negative, check_share
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class PolicyConfig:
     refit: RefitConfig = field(default_factory=RefitConfig)
 
     def __post_init__(self) -> None:
-        check_positive(
+        check_count(
             self,
             "updates",
             "batch_size",

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from phihp_torchrl.evaluation.seeds import check_training_seed
 from phihp_torchrl.planners.factory import PlannerConfig
-from phihp_torchrl.ranges import check_not_negative, check_positive
+from phihp_torchrl.ranges import check_count, check_not_negative
 from phihp_torchrl.tasks import get_task
 from phihp_torchrl.trainers.config import ConfigError, from_mapping
 from phihp_torchrl.trainers.loggers import LoggerConfig
@@ -53,7 +53,7 @@ class EvaluateConfig:
     video: bool = True
 
     def __post_init__(self) -> None:
-        check_positive(self, "episodes")
+        check_count(self, "episodes")
         check_not_negative(self, "latency_actions")
 
 
@@ -107,7 +107,7 @@ class RunConfig:
 
     def __post_init__(self) -> None:
         check_training_seed(self.seed)
-        check_positive(self, "keep_checkpoints", "threads")
+        check_count(self, "keep_checkpoints", "threads")
         if not self.checkpoint_interval >= 0:
             raise ValueError(
                 f"checkpoint_interval: expected seconds >= 0, got {self.checkpoint_interval}."

@@ -20,7 +20,7 @@ from phihp_torchrl.agents import (
     learning_rate_scale,
 )
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
-from phihp_torchrl.ranges import check_not_negative, check_positive, check_share
+from phihp_torchrl.ranges import check_count, check_not_negative, check_share
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.td3_base import TD3Trainer
 
@@ -55,7 +55,7 @@ class RealTD3Config(TD3Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_positive(
+        check_count(
             self,
             "real_steps",
             "batch_size",

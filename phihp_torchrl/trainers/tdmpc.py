@@ -17,7 +17,7 @@ from phihp_torchrl.agents.tdmpc import TOLD, EpisodeReplay, TDMPCConfig, TDMPCUp
 from phihp_torchrl.deployment.tdmpc import TDMPCAgent
 from phihp_torchrl.evaluation import evaluate
 from phihp_torchrl.planners.factory import MPPIConfig, make_latent_planner
-from phihp_torchrl.ranges import check_not_negative, check_positive, check_share
+from phihp_torchrl.ranges import check_count, check_not_negative, check_positive, check_share
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.collect import CollectConfig, Policy, make_real_env, random_policy
 
@@ -61,7 +61,7 @@ class TDMPCTrainConfig:
     planner: MPPIConfig = field(default_factory=MPPIConfig)
 
     def __post_init__(self) -> None:
-        check_positive(self, "real_steps", "horizon", "batch_size", "evaluation_interval")
+        check_count(self, "real_steps", "horizon", "batch_size", "evaluation_interval")
         check_not_negative(
             self, "seed_steps", "priority_alpha", "priority_beta", "evaluation_episodes"
         )

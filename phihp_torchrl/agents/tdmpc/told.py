@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torchrl.modules import MLP
 
-from phihp_torchrl.ranges import check_positive
+from phihp_torchrl.ranges import check_count
 from phihp_torchrl.tasks import Task
 
 
@@ -29,7 +29,7 @@ class TOLDConfig:
     mlp_dim: int = 512
 
     def __post_init__(self) -> None:
-        check_positive(self, "latent_dim", "encoder_dim", "mlp_dim")
+        check_count(self, "latent_dim", "encoder_dim", "mlp_dim")
 
 
 class TOLD(nn.Module):
