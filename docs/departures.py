@@ -18,22 +18,13 @@ from typing import Any
 import yaml
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "recipes"))
+from presets import settings  # noqa: E402  (there since the line above)
+
 PAGE = ROOT / "docs" / "recipes.md"
-CONFIG = ROOT / "recipes" / "config"
 START, END = "<!-- departures:start -->\n", "<!-- departures:end -->"
 HEADER = "| # | key | paper | default | why | measured effect |\n|---:|:---|:---|:---|:---|:---|\n"
 EFFECTS = ROOT / "results" / "departures" / "departures.json"
-
-
-def settings(preset: str) -> dict[str, dict[str, Any]]:
-    """Value of every key of a preset, by key and task; the preset's own value is under ``""``."""
-    base = _flatten(yaml.safe_load((CONFIG / "preset" / f"{preset}.yaml").read_text()))
-    values = {key: {"": value} for key, value in base.items()}
-    for path in sorted((CONFIG / "task").glob("*.yaml"), key=lambda path: path.stem):
-        sections = yaml.safe_load(path.read_text())["presets"]
-        for key, value in {**base, **_flatten(sections.get(preset) or {})}.items():
-            values[key][path.stem] = value
-    return values
 
 
 def departures() -> dict[str, tuple[str, str]]:
@@ -86,14 +77,6 @@ def main() -> None:
 def _unexplained(page: str) -> list[str]:
     rows = [line.split(" | ") for line in page.split(START)[1].split(END)[0].splitlines()[2:]]
     return [cells[1].strip("`") for cells in rows if not cells[4].strip()]
-
-
-def _flatten(mapping: dict[str, Any], path: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in mapping.items():
-        name = f"{path}{key}"
-        flat |= _flatten(value, f"{name}.") if isinstance(value, dict) else {name: value}
-    return flat
 
 
 def _describe(values: dict[str, Any]) -> str:

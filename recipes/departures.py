@@ -22,7 +22,8 @@ from typing import Any
 
 import torch
 import yaml
-from hydra import compose, initialize_config_dir
+from model_error import model_config
+from presets import settings
 
 from phihp_torchrl import get_task
 from phihp_torchrl.evaluation import (
@@ -31,7 +32,7 @@ from phihp_torchrl.evaluation import (
     paired_difference,
     prediction_errors,
 )
-from phihp_torchrl.trainers import ModelTrainer, read_request
+from phihp_torchrl.trainers import ModelTrainer
 
 RECIPES = Path(__file__).parent
 RESULTS = Path("results/departures")
@@ -54,23 +55,15 @@ NOISE = "seed"
 """In the place of a key: the same settings with another seed, to compare the effects with."""
 
 
-def settings(preset: str, task: str) -> dict[str, Any]:
-    """Every key of a preset and its value on a task."""
-    config = RECIPES / "config"
-    base = yaml.safe_load((config / "preset" / f"{preset}.yaml").read_text())
-    own = yaml.safe_load((config / "task" / f"{task}.yaml").read_text())["presets"]
-    return _flatten(base) | _flatten(own.get(preset) or {})
-
-
 def departures(task: str) -> dict[str, Any]:
     """The published value of every key to measure in which the default departs on a task."""
-    paper, ours = settings("paper", task), settings("default", task)
+    paper, ours = settings("paper"), settings("default")
     return {
-        key: paper[key]
-        for key, value in ours.items()
+        key: paper[key][task]
+        for key in ours
         if key.split(".")[0] in ("model", *PHASES)
         and key not in LEFT_OUT
-        and paper[key] != value
+        and paper[key][task] != ours[key][task]
         and ELSEWHERE.get(key, task) == task
     }
 
@@ -78,12 +71,8 @@ def departures(task: str) -> dict[str, Any]:
 @cache
 def model_error(task: str, changes: tuple[str, ...] = ()) -> float:
     """Median 20-step error, from the wide box, of a model of the default preset but for changes."""
-    overrides = [f"task={task}", *changes]
-    with initialize_config_dir(str(RECIPES.absolute() / "config"), version_base="1.3"):
-        config = read_request(compose("phihp", overrides), overrides).config.model
-    assert config is not None  # the method of this recipe has one
     torch.manual_seed(0)
-    trainer = ModelTrainer(get_task(task), config, seed=0)
+    trainer = ModelTrainer(get_task(task), model_config(task, *changes), seed=0)
     while not trainer.done:
         trainer.advance()
     return prediction_errors(get_task(task), trainer.dynamics)["coverage_median"]
@@ -114,28 +103,34 @@ def measure(task: str, key: str, base: Path, out: Path) -> dict[str, Any]:
     """The effect of the published value of ``key``, or of another seed."""
     if key == NOISE:
         return {"value": 1, **rerun(task, "policy", ["seed=1"], base, out)}
-    paper, section = settings("paper", task), key.split(".")[0]
-    changes = [f"{name}={_override(paper[name])}" for name in (key, *TOGETHER.get(key, ()))]
+    paper, section = settings("paper"), key.split(".")[0]
+    changes = [f"{name}={override(paper[name][task])}" for name in (key, *TOGETHER.get(key, ()))]
+    value = paper[key][task]
     if section != "model":
-        return {"value": paper[key], **rerun(task, section, changes, base, out)}
+        return {"value": value, **rerun(task, section, changes, base, out)}
     errors = {"error": model_error(task, tuple(changes)), "default_error": model_error(task)}
-    return {"value": paper[key], **errors}
+    return {"value": value, **errors}
 
 
-def describe(task: str, found: dict[str, Any]) -> str:
+def describe(key: str, found: dict[str, Any]) -> str:
     """The effect of going back to the published value, in a line."""
+    others = " and ".join(f"`{name}`" for name in TOGETHER.get(key, ()))
+    others = f", with {others}" if others else ""
     if "error" in found:
-        return f"{task}: 20-step error × {found['error'] / found['default_error']:.2g}"
+        factor = found["error"] / found["default_error"]
+        return f"{found['task']}: 20-step error × {factor:.2g}{others}"
     texts = [
         f"{role} {row['difference']:+.1f} ± {row['standard_error']:.1f}".replace("-", "−")
         for role in ("planner", "actor")
         if (row := found.get(role))
     ]
-    return f"{task}: {', '.join(texts)}"
+    return f"{found['task']}: {', '.join(texts)}{others}"
 
 
 def write(entries: dict[str, dict[str, Any]]) -> None:
     """The effects, for ``docs/departures.py`` and for people."""
+    for key, entry in entries.items():
+        entry["effect"] = describe(key, entry)
     rows = [[f"`{key}`", str(entry["value"]), entry["effect"]] for key, entry in entries.items()]
     (RESULTS / "departures.json").write_text(json.dumps(entries, indent=1) + "\n")
     (RESULTS / "README.md").write_text(
@@ -148,17 +143,9 @@ def write(entries: dict[str, dict[str, Any]]) -> None:
     )
 
 
-def _override(value: Any) -> str:
+def override(value: Any) -> str:
     """As Hydra's command line takes it."""
     return yaml.safe_dump(value, default_flow_style=True).split("\n")[0]
-
-
-def _flatten(mapping: dict[str, Any], path: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in mapping.items():
-        name = f"{path}{key}"
-        flat |= _flatten(value, f"{name}.") if isinstance(value, dict) else {name: value}
-    return flat
 
 
 def main() -> None:
@@ -170,23 +157,27 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
-    bases = {}
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    path = RESULTS / "departures.json"
+    entries = json.loads(path.read_text()) if path.exists() else {}
+    # Each key on the first task in which it departs, unless it is measured already.
+    wanted: dict[str, str] = {}
     for task in arguments.tasks:
+        for key in (NOISE, *departures(task)):
+            if key not in entries:
+                wanted.setdefault(key, task)
+    bases = {}
+    for task in dict.fromkeys(wanted.values()):
         runs = sorted(arguments.runs.glob(f"{task}-default-n*-seed0/evaluation.json"))
         if not runs:
             sys.exit(f"error: --runs: expected a finished run of {task} in {arguments.runs}.")
         bases[task] = runs[0].parent
-    RESULTS.mkdir(parents=True, exist_ok=True)
-    path = RESULTS / "departures.json"
-    entries = json.loads(path.read_text()) if path.exists() else {}
-    for task, base in bases.items():
-        for key in (NOISE, *departures(task)):
-            if key in entries:
-                continue
-            found = measure(task, key, base, arguments.out / f"{task}-{key}")
-            entries[key] = {"task": task, "effect": describe(task, found), **found}
-            write(entries)
-            print(f"{key}={found['value']}: {entries[key]['effect']}", flush=True)
+    for key, task in wanted.items():
+        found = measure(task, key, bases[task], arguments.out / f"{task}-{key}")
+        entries[key] = {"task": task, **found}
+        write(entries)
+        print(f"{key}={found['value']}: {entries[key]['effect']}", flush=True)
+    write(entries)
 
 
 if __name__ == "__main__":

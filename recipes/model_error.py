@@ -32,9 +32,9 @@ from phihp_torchrl.trainers import ModelConfig, ModelTrainer, make_dynamics, rea
 RESULTS = Path("results/model_error")
 
 
-def model_config(task: str) -> ModelConfig:
-    """The default preset's phase 1."""
-    overrides = [f"task={task}"]
+def model_config(task: str, *changes: str) -> ModelConfig:
+    """The default preset's phase 1, but for changes as on the command line."""
+    overrides = [f"task={task}", *changes]
     with initialize_config_dir(
         str(Path(__file__).parent.absolute() / "config"), version_base="1.3"
     ):

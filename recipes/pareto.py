@@ -20,6 +20,7 @@ from statistics import median
 
 import torch
 from matplotlib.figure import Figure
+from presets import settings
 from tensordict import TensorDict
 
 from phihp_torchrl import load_agent
@@ -27,7 +28,7 @@ from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.evaluation import (
     EVALUATION_SEED,
-    PUBLISHED_SAMPLES,
+    TARGETS,
     evaluate,
     markdown_table,
     paired_difference,
@@ -36,15 +37,6 @@ from phihp_torchrl.planners.factory import PlannerConfig, make_planner
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/pareto")
 SWEEP_SEED = 0  # of training: the choice must not see an evaluation seed
-# SPEC section 4: horizon and weight of Q of each task.
-TASKS = {
-    "pendulum": (5, 1.5),
-    "pendulum-swingup": (5, 1.5),
-    "cartpole": (4, 0.2),
-    "cartpole-swingup": (6, 0.03),
-    "acrobot": (4, 0.8),
-    "acrobot-swingup": (3, 0.8),
-}
 AROUND_ACTOR = {"policy_noise": 0.2, "policy_noise_clip": 0.6, "top_k": 6}
 WARM = {**AROUND_ACTOR, "warm_start": True, "num_kept_elites": 2, "init_std": 0.5}
 BUDGETS = {
@@ -68,8 +60,14 @@ def planner_config(agent: Agent, name: str) -> PlannerConfig:
     changes = BUDGETS[name]
     if changes is None:
         return agent.planner_config
-    horizon, alpha = TASKS[agent.task.name]
-    published = PlannerConfig(planning_horizon=horizon, alpha=alpha, compare_with_actor=False)
+    paper, section = settings("paper"), "planner."
+    published = PlannerConfig(
+        **{
+            key.removeprefix(section): paper[key][agent.task.name]
+            for key in paper
+            if key.startswith(section)
+        }
+    )
     if not changes:
         return published
     # Ours keep horizon and weight of the agent, and the actor's own action competes.
@@ -213,7 +211,7 @@ def write(results: dict) -> None:
 def main() -> None:
     """Sweep, or report the choice."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", nargs="+", choices=list(PUBLISHED_SAMPLES), default=list(TASKS))
+    parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
     parser.add_argument("--episodes", type=int, default=20, help="a budget, from training seeds")
     parser.add_argument("--calls", type=int, default=100, help="timed actions a budget")
     parser.add_argument("--report", action="store_true", help="the choice, on evaluation seeds")

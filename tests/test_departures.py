@@ -17,6 +17,7 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 
 @pytest.fixture
 def recipe(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(RECIPES))
     spec = importlib.util.spec_from_file_location("departures_recipe", RECIPES / "departures.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -38,19 +39,25 @@ def test_departures_are_those_of_the_task(recipe):
 @pytest.mark.parametrize("task", ["pendulum-swingup", "acrobot", "cartpole-swingup"])
 def test_every_published_value_is_one_that_the_recipes_take(recipe, task):
     with initialize_config_dir(str(RECIPES / "config"), version_base="1.3"):
+        paper = recipe.settings("paper")
         for key, value in recipe.departures(task).items():
-            changes = [f"task={task}", f"{key}={recipe._override(value)}"]
-            changes += [f"{k}={recipe._override(recipe.settings('paper', task)[k])}"
+            changes = [f"task={task}", f"{key}={recipe.override(value)}"]
+            changes += [f"{k}={recipe.override(paper[k][task])}"
                         for k in recipe.TOGETHER.get(key, ())]  # fmt: skip
             read_request(compose("phihp", changes), changes)
 
 
 def test_effects_in_words(recipe):
     role = {"default": -350.0, "difference": -12.34, "standard_error": 1.2}
-    found = {"value": 3, "planner": role, "actor": {**role, "difference": 2.0}}
-    assert recipe.describe("acrobot", found) == "acrobot: planner −12.3 ± 1.2, actor +2.0 ± 1.2"
-    errors = {"error": 0.3, "default_error": 0.1}
-    assert recipe.describe("acrobot", errors) == "acrobot: 20-step error × 3"
+    found = {"task": "acrobot", "value": 3, "planner": role, "actor": {**role, "difference": 2.0}}
+    assert (
+        recipe.describe("planner.alpha", found) == "acrobot: planner −12.3 ± 1.2, actor +2.0 ± 1.2"
+    )
+    errors = {"task": "acrobot", "error": 0.3, "default_error": 0.1}
+    assert recipe.describe("model.activation", errors) == "acrobot: 20-step error × 3"
+    assert recipe.describe("model.fit.method", errors) == (
+        "acrobot: 20-step error × 3, with `model.fit.steps` and `model.warm_start`"
+    )
 
 
 def test_what_is_measured_is_written_and_not_measured_again(recipe, tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ from phihp_torchrl.deployment import Agent
 from phihp_torchrl.evaluation import EVALUATION_SEED
 from phihp_torchrl.planners.factory import PlannerConfig
 
-RECIPE = Path(__file__).parents[1] / "recipes" / "pareto.py"
+RECIPES = Path(__file__).parents[1] / "recipes"
 TINY = PlannerConfig(
     planning_horizon=2, optim_steps=1, num_candidates=4, top_k=2, num_policy_candidates=2, alpha=0.7
 )
@@ -25,7 +25,8 @@ TINY = PlannerConfig(
 
 @pytest.fixture
 def recipe(tmp_path, monkeypatch):
-    spec = importlib.util.spec_from_file_location("pareto_recipe", RECIPE)
+    monkeypatch.syspath_prepend(str(RECIPES))
+    spec = importlib.util.spec_from_file_location("pareto_recipe", RECIPES / "pareto.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     task = replace(get_task("pendulum"), max_steps=2)
