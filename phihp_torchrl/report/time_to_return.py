@@ -47,8 +47,8 @@ def time_to_return(runs: Sequence[Run], benchmarks: Path) -> Section:
         "The return is the published one, our target where there is none. It is reached when the "
         "actor earns it in the real world at an evaluation during training, of 10 episodes and for "
         "the log alone, or at the end, planner or actor, of the final ones. *In all* is phases 1 "
-        "and 2. *Published updates* is the paper's number of TD3 updates times the median of ours at "
-        "its batch of 64, from `make bench`: without imagining, and without a model."
+        "and 2. *Published updates* is the paper's number of TD3 updates times the median of "
+        "ours at its batch of 64, from `make bench`: without imagining, and without a model."
     )
     table = Table("time_to_return", header, rows)
     return Section("From nothing to the published return", text, {"Seconds on one core": table})
