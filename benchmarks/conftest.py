@@ -11,6 +11,7 @@ import torch
 from race import figures
 
 from phihp_torchrl.evaluation import markdown_table
+from phihp_torchrl.origin import describe_origin, origin_text
 
 RESULTS = Path(__file__).parent.parent / "results" / "benchmarks"
 HEAD = (
@@ -24,6 +25,7 @@ HEAD = (
 torch.set_num_threads(1)
 torch.set_flush_denormal(True)
 _sections: dict[str, dict] = {}
+ORIGIN = describe_origin(seed=0)
 
 
 @pytest.fixture
@@ -51,7 +53,8 @@ def report_memory():
 
 
 def _add(title, note, header, cells):
-    machine = f"torch {torch.__version__}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
+    load = os.getloadavg()[0]
+    machine = f"{origin_text(ORIGIN)}, load {load:.1f}, torch {torch.__version__}"
     _sections[title] = {"note": note, "machine": machine, "header": header, "rows": cells}
 
 

@@ -32,6 +32,7 @@ from phihp_torchrl.evaluation import (
     paired_difference,
     prediction_errors,
 )
+from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.trainers import ModelTrainer
 
 RECIPES = Path(__file__).parent
@@ -131,7 +132,10 @@ def write(entries: dict[str, dict[str, Any]]) -> None:
     """The effects, for ``docs/departures.py`` and for people."""
     for key, entry in entries.items():
         entry["effect"] = describe(key, entry)
-    rows = [[f"`{key}`", str(entry["value"]), entry["effect"]] for key, entry in entries.items()]
+    rows = [
+        [f"`{key}`", str(entry["value"]), entry["effect"], entry.get("origin", "not recorded")]
+        for key, entry in entries.items()
+    ]
     (RESULTS / "departures.json").write_text(json.dumps(entries, indent=1) + "\n")
     (RESULTS / "README.md").write_text(
         "# What the departures do\n\nMade by `python recipes/departures.py`: the default preset "
@@ -139,7 +143,7 @@ def write(entries: dict[str, dict[str, Any]]) -> None:
         "same 50 episodes, one run each, with its standard error; or the factor on the median "
         f"20-step error from the task's wide box. The row `{NOISE}` is the default preset's policy "
         "of another seed: smaller effects than its are not told from chance.\n\n"
-        + markdown_table(["key", "value", "published less default"], rows)
+        + markdown_table(["key", "value", "published less default", "made at"], rows)
     )
 
 
@@ -174,7 +178,7 @@ def main() -> None:
         bases[task] = runs[0].parent
     for key, task in wanted.items():
         found = measure(task, key, bases[task], arguments.out / f"{task}-{key}")
-        entries[key] = {"task": task, **found}
+        entries[key] = {"task": task, **found, "origin": origin_text(describe_origin(seed=0))}
         write(entries)
         print(f"{key}={found['value']}: {entries[key]['effect']}", flush=True)
     write(entries)

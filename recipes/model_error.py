@@ -27,6 +27,7 @@ from phihp_torchrl.evaluation import (
     markdown_table,
     prediction_errors,
 )
+from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.trainers import ModelConfig, ModelTrainer, make_dynamics, read_request
 
 RESULTS = Path("results/model_error")
@@ -66,6 +67,7 @@ def compare(name: str, seed: int) -> dict[str, object]:
         "hybrid": prediction_errors(task, trainer.dynamics),
         "data_driven": prediction_errors(task, fit_data_driven(task, config, trainer.data, seed)),
         "constants": constants,
+        "origin": origin_text(describe_origin(seed)),
     }
 
 
@@ -84,6 +86,7 @@ def write_tables() -> None:
     results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
     results.sort(key=lambda result: list(PUBLISHED_SAMPLES).index(result["task"]))
     errors, constants = [], []
+    origins = "; ".join(f"{r['task']}, {r.get('origin', 'not recorded')}" for r in results)
     for result in results:
         for where in ("reset", "coverage"):
             parts = [
@@ -107,7 +110,8 @@ def write_tables() -> None:
         f"{markdown_table(error_header, errors)}\n"
         "# Identified constants\n\n"
         "Each constant's first guess is 30 % off; the combinations that the motion determines:\n\n"
-        f"{markdown_table(constants_header, constants)}"
+        f"{markdown_table(constants_header, constants)}\n"
+        f"Made at: {origins}.\n"
     )
     (RESULTS / "README.md").write_text(text)
 

@@ -3,10 +3,11 @@
     python recipes/pareto.py --tasks pendulum-swingup acrobot
     python recipes/pareto.py --report               # the choice, on evaluation seeds, once
 
-Reads the agents in results/agents. The sweep plays paired episodes from seeds of training, and its
-choice is the budget with the fewest milliseconds whose return is, on no task, more than two
-standard errors below the published budget's. Only --report plays evaluation seeds: the published
-budget and the chosen one, 50 paired episodes. Writes results/pareto/.
+Reads the agents in results/agents; tasks that were swept before stay. The sweep plays paired
+episodes from seeds of training, and its choice is the budget with the fewest milliseconds whose
+return is, on no task, more than two standard errors below the published budget's. Only --report
+plays evaluation seeds: the published budget and the chosen one, 50 paired episodes. Writes
+results/pareto/.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 
@@ -33,58 +33,53 @@ from phihp_torchrl.evaluation import (
     markdown_table,
     paired_difference,
 )
+from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.planners.factory import PlannerConfig, make_planner
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/pareto")
 SWEEP_SEED = 0  # of training: the choice must not see an evaluation seed
-AROUND_ACTOR = {"policy_noise": 0.2, "policy_noise_clip": 0.6, "top_k": 6}
-WARM = {**AROUND_ACTOR, "warm_start": True, "num_kept_elites": 2, "init_std": 0.5}
 BUDGETS = {
     "220 x 3, published": {},
-    "agent's own": None,
-    "64 x 2": {**WARM, "num_candidates": 64, "optim_steps": 2},
-    "64 x 1": {**WARM, "num_candidates": 64, "optim_steps": 1, "num_kept_elites": 0},
-    "64 x 1, actor's alone": {
-        **AROUND_ACTOR, "num_candidates": 64, "num_policy_candidates": 64, "optim_steps": 1
-    },
-    "32 x 2": {**WARM, "num_candidates": 32, "optim_steps": 2, "num_policy_candidates": 10},
-    "32 x 1, actor's alone": {
-        **AROUND_ACTOR, "num_candidates": 32, "num_policy_candidates": 32, "optim_steps": 1
+    "192 x 1": {"num_candidates": 192},
+    "128 x 1": {"num_candidates": 128},
+    "96 x 1": {"num_candidates": 96},
+    "64 x 1": {"num_candidates": 64},
+    "64 x 2": {"num_candidates": 64, "optim_steps": 2, "num_kept_elites": 2},
+    "32 x 2": {
+        "num_candidates": 32, "optim_steps": 2, "num_kept_elites": 2, "num_policy_candidates": 10
     },
 }  # fmt: skip
+"""What a budget sets, over the published planner or over what all of ours share."""
 PUBLISHED = next(iter(BUDGETS))
+OURS = {
+    "optim_steps": 1,
+    "top_k": 6,
+    "num_policy_candidates": 20,
+    "policy_noise": 0.2,
+    "policy_noise_clip": 0.6,
+    "init_std": 1.0,
+    "select": "mean",
+    "num_kept_elites": 0,
+    "compare_with_actor": True,
+    "warm_start": True,
+}
 
 
-def planner_config(agent: Agent, name: str) -> PlannerConfig:
-    """The published settings of the agent's task; but for the published one, our changes."""
-    changes = BUDGETS[name]
-    if changes is None:
-        return agent.planner_config
-    paper, section = settings("paper"), "planner."
-    published = PlannerConfig(
-        **{
-            key.removeprefix(section): paper[key][agent.task.name]
-            for key in paper
-            if key.startswith(section)
-        }
-    )
-    if not changes:
-        return published
-    # Ours keep horizon and weight of the agent, and the actor's own action competes.
-    own = agent.planner_config
-    return replace(
-        published,
-        planning_horizon=own.planning_horizon,
-        alpha=own.alpha,
-        compare_with_actor=True,
-        **changes,
-    )
+def planner_config(task: str, name: str) -> PlannerConfig:
+    """The published planner of the task; for our budgets the default preset's, with changes."""
+    preset, section = settings("paper" if name == PUBLISHED else "default"), "planner."
+    own = {
+        key.removeprefix(section): values[task]
+        for key, values in preset.items()
+        if key.startswith(section)
+    }
+    return PlannerConfig(**own if name == PUBLISHED else {**own, **OURS, **BUDGETS[name]})
 
 
 def build(agent: Agent, name: str, compile: bool = False):
     """The planner of a budget."""
     model = TaskWorldModel(agent.task, agent.dynamics)
-    config = planner_config(agent, name)
+    config = planner_config(agent.task.name, name)
     return make_planner(model, agent.actor, agent.qvalue, config, compile=compile)
 
 
@@ -104,9 +99,11 @@ def latencies(planners: dict, agent: Agent, calls: int) -> dict[str, float]:
 def sweep(task: str, episodes: int, calls: int) -> dict[str, dict[str, object]]:
     """Returns and latency of every budget on a task."""
     agent = load_agent(AGENTS / task)
-    milliseconds = latencies({name: build(agent, name) for name in BUDGETS}, agent, calls)
+    compiled = {name: build(agent, name, compile=True) for name in BUDGETS}
+    milliseconds = latencies(compiled, agent, calls)
     rows: dict[str, dict[str, object]] = {}
     for name in BUDGETS:
+        torch.manual_seed(SWEEP_SEED)
         played = evaluate(build(agent, name), agent.task, episodes=episodes, seed=SWEEP_SEED)
         rows[name] = {"ms": milliseconds[name], "returns": played.returns.tolist()}
         print(f"{task}: {name}: {played.mean:.1f}, {milliseconds[name]:.2f} ms", flush=True)
@@ -150,6 +147,11 @@ def report(task: str, chosen: str, calls: int) -> dict[str, float]:
     }
 
 
+def origins(of: dict[str, str]) -> str:
+    """Commit and machine of each task, in a sentence."""
+    return "Made at: " + "; ".join(f"{task}, {text}" for task, text in of.items()) + ".\n"
+
+
 def write(results: dict) -> None:
     """Tables and picture of all tasks done so far."""
     tasks = results["tasks"]
@@ -169,21 +171,21 @@ def write(results: dict) -> None:
             )
             cells = [f"{row['ms']:.2f}", f"{returns.mean():.1f}"]
             gap_text = f"{gap.mean:+.1f} ± {gap.standard_error:.1f}"
-            lines.append([task, name, *cells, gap_text])
+            lines.append([task, str(len(returns)), name, *cells, gap_text])
         axis.set_title(task)
         axis.set_xscale("log")
-        axis.set_xlabel("ms for an action, eager")
+        axis.set_xlabel("ms for an action")
     panels[0].set_ylabel("return")
     panels[-1].legend(fontsize=6)
     RESULTS.mkdir(parents=True, exist_ok=True)
     figure.savefig(RESULTS / "pareto.png", dpi=110)
     (RESULTS / "pareto.json").write_text(json.dumps(results, indent=1) + "\n")
-    header = ["task", "candidates x iterations", "ms", "return", "less the published"]
+    header = ["task", "episodes", "candidates x iterations", "ms", "return", "less the published"]
     text = (
         "# Return against latency\n\n"
-        "Made by `python recipes/pareto.py`. Paired episodes from seeds of training, "
-        f"{results['episodes']} a budget; eager plans, CPU milliseconds. Chosen: "
-        f"**{choose(tasks)}**.\n\n![pareto](pareto.png)\n\n{markdown_table(header, lines)}"
+        "Made by `python recipes/pareto.py`. Paired episodes from seeds of training; compiled "
+        f"plans, CPU milliseconds. Chosen: **{choose(tasks)}**.\n\n![pareto](pareto.png)\n\n"
+        f"{markdown_table(header, lines)}\n{origins(results['origins'])}"
     )
     if reported := results.get("report"):
         header = ["task", "published", "chosen", "difference", "published, eager, ms"]
@@ -202,7 +204,8 @@ def write(results: dict) -> None:
         ]
         text += (
             "\n## On evaluation seeds\n\n`python recipes/pareto.py --report`: "
-            f"{reported['chosen']}, 50 paired episodes.\n\n{markdown_table(header, lines)}"
+            f"{reported['chosen']}, 50 paired episodes.\n\n{markdown_table(header, lines)}\n"
+            f"{origins({'all tasks': reported['origin']})}"
         )
     (RESULTS / "README.md").write_text(text)
 
@@ -220,17 +223,21 @@ def main() -> None:
     torch.set_flush_denormal(True)
     torch.manual_seed(SWEEP_SEED)
     path = RESULTS / "pareto.json"
+    origin = origin_text(describe_origin(SWEEP_SEED))
+    results = json.loads(path.read_text()) if path.is_file() else {"tasks": {}, "origins": {}}
     if arguments.report:
-        results = json.loads(path.read_text())
         chosen = choose(results["tasks"])
         rows = {task: report(task, chosen, arguments.calls) for task in results["tasks"]}
-        results["report"] = {"chosen": chosen, "rows": rows}
+        results["report"] = {"chosen": chosen, "rows": rows, "origin": origin}
         write(results)
         return
-    swept = {}
+    # What was swept with other budgets cannot be compared, nor can a report on what they were.
+    same = [task for task, rows in results["tasks"].items() if list(rows) == list(BUDGETS)]
+    results = {key: {task: results[key][task] for task in same} for key in ("tasks", "origins")}
     for task in arguments.tasks:
-        swept[task] = sweep(task, arguments.episodes, arguments.calls)
-        write({"episodes": arguments.episodes, "tasks": swept})
+        results["tasks"][task] = sweep(task, arguments.episodes, arguments.calls)
+        results["origins"][task] = origin
+        write(results)
 
 
 if __name__ == "__main__":

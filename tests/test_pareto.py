@@ -52,12 +52,16 @@ def test_the_cheapest_that_loses_nothing(recipe, monkeypatch):
 
 def test_budgets(recipe):
     agent = recipe.load_agent("")
-    published = recipe.planner_config(agent, recipe.PUBLISHED)
+    published = recipe.planner_config("acrobot", recipe.PUBLISHED)
     assert (published.num_candidates, published.optim_steps) == (220, 3)
     assert not published.compare_with_actor
-    assert recipe.planner_config(agent, "agent's own") == TINY
+    assert (published.planning_horizon, published.alpha) == (4, 0.8)
+    ours = recipe.planner_config("acrobot", "64 x 1")
+    assert (ours.num_candidates, ours.optim_steps) == (64, 1)
+    assert ours.compare_with_actor
+    assert ours.planning_horizon == 20
     for name in recipe.BUDGETS:
-        assert recipe.build(agent, name).settings.planning_horizon in (2, 5)
+        assert recipe.build(agent, name).settings.num_candidates <= 220
 
 
 def test_the_choice_never_sees_an_evaluation_seed(recipe, monkeypatch, capsys):
@@ -68,6 +72,8 @@ def test_the_choice_never_sees_an_evaluation_seed(recipe, monkeypatch, capsys):
         return play(policy, task, episodes=2, seed=seed)
 
     monkeypatch.setattr(recipe, "evaluate", watched)
+    build = recipe.build
+    monkeypatch.setattr(recipe, "build", lambda agent, name, compile=False: build(agent, name))
     monkeypatch.setattr(sys, "argv", ["pareto.py", "--tasks", "pendulum", "--calls", "10"])
     recipe.main()
     assert set(seeds) == {recipe.SWEEP_SEED}
@@ -75,13 +81,29 @@ def test_the_choice_never_sees_an_evaluation_seed(recipe, monkeypatch, capsys):
     assert len(seeds) == len(recipe.BUDGETS)
     assert (recipe.RESULTS / "pareto.png").is_file()
     # The report plays the two that it compares once each.
-    build = recipe.build
-    monkeypatch.setattr(recipe, "build", lambda agent, name, compile=False: build(agent, name))
     monkeypatch.setattr(sys, "argv", ["pareto.py", "--report", "--calls", "10"])
     seeds.clear()
     recipe.main()
     assert seeds == [EVALUATION_SEED] * 2
     results = json.loads((recipe.RESULTS / "pareto.json").read_text())
     assert results["report"]["chosen"] in recipe.BUDGETS
+    assert list(results["origins"]) == ["pendulum"]
     assert "On evaluation seeds" in (recipe.RESULTS / "README.md").read_text()
     assert torch.get_num_threads() == 1
+
+
+def test_tasks_swept_before_stay(recipe, monkeypatch):
+    """Unless they were swept with other budgets, with which these cannot be compared."""
+
+    def swept(budgets, task):
+        monkeypatch.setattr(recipe, "BUDGETS", dict.fromkeys(budgets))
+        found = rows(**{name: (9.0, 0.0) for name in budgets})
+        monkeypatch.setattr(recipe, "sweep", lambda *_: found)
+        monkeypatch.setattr(sys, "argv", ["pareto.py", "--tasks", task])
+        recipe.main()
+        return list(json.loads((recipe.RESULTS / "pareto.json").read_text())["tasks"])
+
+    monkeypatch.setattr(recipe, "PUBLISHED", "published")
+    assert swept(["published", "cheap"], "acrobot") == ["acrobot"]
+    assert swept(["published", "cheap"], "pendulum") == ["acrobot", "pendulum"]
+    assert swept(["published", "cheap", "new"], "pendulum") == ["pendulum"]

@@ -16,6 +16,7 @@ import yaml
 
 from phihp_torchrl.benchmark.cell import DEFAULT_METHOD
 from phihp_torchrl.evaluation import CurvePoint, curve_from_metrics, read_curve
+from phihp_torchrl.origin import commit_text, machine_text
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,6 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
         _check_version(session["versions"]["phihp_torchrl"])
     method, task = config.get("method", DEFAULT_METHOD), config["task"]
     kind = (config.get("model") or {}).get("kind")
-    machine = session["machine"]
     return Run(
         folder=folder,
         method=method,
@@ -133,8 +133,8 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
         samples=int(cell.get("samples") or metadata["real_steps"]),
         seed=int(config["seed"]),
         kind=kind,
-        commit=str(session["commit"])[:7] + ("+" if session["dirty"] else ""),
-        machine=f"{machine['cpus']} cores, {machine['memory_gib']:.0f} GiB, {machine['gpus']} GPUs",
+        commit=commit_text(session),
+        machine=machine_text(session),
         seconds={str(k): float(v) for k, v in metadata["seconds"].items()},
         acting=_acting(_read_json(folder / "evaluation.json")),
         curve=_curve(folder),

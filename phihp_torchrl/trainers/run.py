@@ -15,6 +15,7 @@ import torch
 from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from tqdm.auto import tqdm
 
+from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.trainers.checkpoints import (
     clear_rotation,
     load_latest,
@@ -26,7 +27,7 @@ from phihp_torchrl.trainers.interrupt import Interrupt
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
 from phihp_torchrl.trainers.phases import PHASE_KINDS, Phase, check_phases, make_phase, real_steps
 from phihp_torchrl.trainers.run_config import RunConfig, check_task
-from phihp_torchrl.trainers.run_directory import MetricsTable, RunDirectory, describe_origin
+from phihp_torchrl.trainers.run_directory import MetricsTable, RunDirectory
 from phihp_torchrl.trainers.start import check_same, start_directory
 
 _log = logging.getLogger(__name__)

@@ -5,22 +5,15 @@ from __future__ import annotations
 import csv
 import json
 import os
-import platform
-import subprocess
-import sys
 from collections.abc import Mapping
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import OmegaConf
 from torchrl.checkpoint import CheckpointRotation
 
 from phihp_torchrl.trainers.config import ConfigError
-
-_PACKAGES = ("phihp_torchrl", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
 
 
 class RunDirectory:
@@ -102,54 +95,6 @@ def new_run_directory(task: str, label: str) -> Path:
             continue
         return path
     raise ConfigError(f"run_dir: {parent / name} and 998 more are taken; name one.")
-
-
-def describe_origin(seed: int) -> dict[str, Any]:
-    """Seed, time, command, commit, machine and versions."""
-    versions = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "not installed"
-    status = _git("status", "--porcelain", "--untracked-files=no")
-    return {
-        "seed": seed,
-        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "commit": _git("rev-parse", "HEAD"),
-        "dirty": None if status is None else bool(status),
-        "machine": {
-            "system": f"{platform.system()} {platform.machine()}",
-            "cpus": os.cpu_count(),
-            "memory_gib": _memory_gib(),
-            "gpus": torch.cuda.device_count(),
-        },
-        "versions": versions,
-    }
-
-
-def _memory_gib() -> float | None:
-    try:
-        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
-    except (AttributeError, ValueError, OSError):  # not every system tells
-        return None
-
-
-def _git(*arguments: str) -> str | None:
-    """What git says about the source tree; ``None`` where there is no git or no repository."""
-    try:
-        done = subprocess.run(
-            ["git", *arguments],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip()
 
 
 def write_atomically(path: Path, text: str) -> None:

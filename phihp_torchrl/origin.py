@@ -1,0 +1,107 @@
+"""Where a result comes from: the code, the command and the machine that made it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping
+from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+_PACKAGES = ("phihp_torchrl", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
+
+
+def describe_origin(seed: int) -> dict[str, Any]:
+    """Seed, time, command, commit, machine and versions, ready for JSON.
+
+    Args:
+        seed: what everything random was drawn from.
+
+    Examples:
+        >>> origin = describe_origin(seed=3)
+        >>> origin["seed"], sorted(origin["machine"])
+        (3, ['cpus', 'gpus', 'memory_gib', 'system'])
+    """
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "not installed"
+    status = _git("status", "--porcelain", "--untracked-files=no")
+    return {
+        "seed": seed,
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "commit": _git("rev-parse", "HEAD"),
+        "dirty": None if status is None else bool(status),
+        "machine": {
+            "system": f"{platform.system()} {platform.machine()}",
+            "cpus": os.cpu_count(),
+            "memory_gib": _memory_gib(),
+            "gpus": torch.cuda.device_count(),
+        },
+        "versions": versions,
+    }
+
+
+def origin_text(origin: Mapping[str, Any]) -> str:
+    """Commit and machine, as they stand below a published table.
+
+    Examples:
+        >>> origin_text({"commit": "5e6e490c0ffee", "dirty": False,
+        ...              "machine": {"cpus": 2, "memory_gib": 23.5, "gpus": 0}})
+        'commit 5e6e490, 2 cores, 24 GiB, 0 GPUs'
+    """
+    return f"commit {commit_text(origin)}, {machine_text(origin)}"
+
+
+def commit_text(origin: Mapping[str, Any]) -> str:
+    """The commit in short, with a ``+`` where the source tree had changes.
+
+    Examples:
+        >>> commit_text({"commit": "5e6e490c0ffee", "dirty": True})
+        '5e6e490+'
+    """
+    return str(origin["commit"])[:7] + ("+" if origin["dirty"] else "")
+
+
+def machine_text(origin: Mapping[str, Any]) -> str:
+    """The size of the machine, in words.
+
+    Examples:
+        >>> machine_text({"machine": {"cpus": 2, "memory_gib": 23.5, "gpus": 0}})
+        '2 cores, 24 GiB, 0 GPUs'
+    """
+    machine = origin["machine"]
+    memory = "unknown" if machine["memory_gib"] is None else f"{machine['memory_gib']:.0f} GiB"
+    return f"{machine['cpus']} cores, {memory}, {machine['gpus']} GPUs"
+
+
+def _memory_gib() -> float | None:
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (AttributeError, ValueError, OSError):  # not every system tells
+        return None
+
+
+def _git(*arguments: str) -> str | None:
+    """What git says about the source tree; ``None`` where there is no git or no repository."""
+    try:
+        done = subprocess.run(
+            ["git", *arguments],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
