@@ -90,9 +90,17 @@ def changes(config: Config, own: PlannerConfig) -> Iterator[tuple[str, int, Plan
 
 
 def candidates(own: PlannerConfig, actors: int, random: int) -> PlannerConfig:
-    """A planner with other candidates; it has no more elites than candidates."""
+    """A planner with other candidates; what they leave no room for is given up."""
     elites = min(own.top_k, actors + random)
-    return replace(own, num_policy_candidates=actors, num_candidates=actors + random, top_k=elites)
+    return replace(
+        own,
+        num_policy_candidates=actors,
+        num_candidates=actors + random,
+        top_k=elites,
+        num_kept_elites=min(own.num_kept_elites, elites),
+        warm_start=own.warm_start and random > 0,  # random candidates start from the last plan
+        compare_with_actor=own.compare_with_actor and actors > 0,
+    )
 
 
 def play(
