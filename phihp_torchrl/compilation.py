@@ -41,7 +41,7 @@ def _linear(input: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> T
 
 
 def compile_graph(
-    function: Callable[P, R], *, enabled: bool = True, **options: Any
+    function: Callable[P, R], *, enabled: bool = True, cpp_wrapper: bool = False, **options: Any
 ) -> Callable[P, R]:
     """Compile a pure function of tensors as one graph, which fails where it would break.
 
@@ -53,6 +53,8 @@ def compile_graph(
         function: what to compile. What it closes over is a constant of the graph, except tensors:
             those changed in place never compile anew.
         enabled: ``False`` leaves the function as it is.
+        cpp_wrapper: call the kernels from C++ in place of Python. Compiling takes longer, a call of
+            many small kernels less time.
         options: for :func:`torch.compile`, beside and over ours.
 
     Examples:
@@ -70,7 +72,10 @@ def compile_graph(
     graph.__code__ = graph.__code__.replace()
     defaults: dict[str, Any] = {"fullgraph": True, "dynamic": False}
     if options.get("backend", "inductor") == "inductor" and torch.backends.mkldnn.is_available():
-        defaults["options"] = {"post_grad_custom_post_pass": _MatricesByOneDNN()}
+        defaults["options"] = {
+            "post_grad_custom_post_pass": _MatricesByOneDNN(),
+            "cpp_wrapper": cpp_wrapper,
+        }
     return torch.compile(graph, **{**defaults, **options})
 
 

@@ -59,7 +59,7 @@ def test_budgets(recipe):
     ours = recipe.planner_config("acrobot", "64 x 1")
     assert (ours.num_candidates, ours.optim_steps) == (64, 1)
     assert ours.compare_with_actor
-    assert ours.planning_horizon == 20
+    assert ours.planning_horizon == 5
     for name in recipe.BUDGETS:
         assert recipe.build(agent, name).settings.num_candidates <= 220
 

@@ -211,7 +211,12 @@ class SamplingPlanner(MPCPlannerBase):
         problem = self.problem()
         function = partial(self._plan, problem=problem, settings=self.settings)
         options = dict(self._compile) if isinstance(self._compile, dict) else {}
-        return compile_graph(function, enabled=self._compiles, **options)
+        return compile_graph(
+            function,
+            enabled=self._compiles,
+            cpp_wrapper=self._action_low.device.type == "cpu",
+            **options,
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         # The functions hold on to these very modules, so a copy builds its own.
