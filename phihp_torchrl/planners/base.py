@@ -100,6 +100,7 @@ class SamplingPlanner(MPCPlannerBase):
         low, high = find_limits(action_spec)
         self.register_buffer("_action_low", low, persistent=False)
         self.register_buffer("_action_high", high, persistent=False)
+        self._bounds: ActionBounds | None = None  # made once from these, not for each action
         self.memory = memory
         self._choose_backend(backend, done_keys is None, bool(compile))
         # A tensor model finds the state from one observation, on either path.
@@ -203,8 +204,7 @@ class SamplingPlanner(MPCPlannerBase):
             actor = actor_function(self.actor, self.action_key, action_shape.numel())
         if self.qvalue is not None:
             value = value_function(self.qvalue, self.value_key, self.action_key, action_shape)
-        bounds = ActionBounds.from_limits(self._action_low, self._action_high)
-        return Problem(model=model, bounds=bounds, actor=actor, value=value)
+        return Problem(model=model, bounds=self.bounds, actor=actor, value=value)
 
     def _build(self) -> Callable[..., Any]:
         """The plan as a function of observation, noise and mean."""
@@ -223,6 +223,7 @@ class SamplingPlanner(MPCPlannerBase):
         return {**super().__getstate__(), "_planning_functions": {}}
 
     def _apply(self, *args: Any, **kwargs: Any) -> SamplingPlanner:
+        self._bounds = None
         self._planning_functions = {}  # they hold the bounds as they were
         return super()._apply(*args, **kwargs)
 
@@ -249,7 +250,9 @@ class SamplingPlanner(MPCPlannerBase):
     @property
     def bounds(self) -> ActionBounds:
         """Where actions may be."""
-        return ActionBounds.from_limits(self._action_low, self._action_high)
+        if self._bounds is None:
+            self._bounds = ActionBounds.from_limits(self._action_low, self._action_high)
+        return self._bounds
 
     def _call_plan(self, tensordict: TensorDictBase, *args: Any) -> Any:
         """Call the plan with what it is made from, and further arguments."""

@@ -45,6 +45,9 @@ class PlanMemory:
             center: what comes before the first plan and after the end of the others, ``[H, m]``.
         """
         cold = center.expand(*batch, *center.shape)
+        if self.replan_every == 1:  # all rows are due, always: no ages to keep, which take time
+            self._plans = plan(self.recall(is_init, cold) if self.warm_start else None)
+            return self._plans[..., 0, :]
         plans, age = self._plans, self._age
         if plans is None or age is None or not self._fits(cold):
             plans = plan(cold if self.warm_start else None)
@@ -54,7 +57,7 @@ class PlanMemory:
             if is_init is not None:
                 age = age.masked_fill(is_init, self.replan_every)
             due = age >= self.replan_every
-            if self.replan_every == 1 or due.any():
+            if due.any():
                 mean = self.recall(is_init, cold) if self.warm_start else None
                 plans = torch.where(due[..., None, None], plan(mean), plans)
                 age = age.masked_fill(due, 0)
