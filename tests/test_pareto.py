@@ -10,12 +10,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
 from phihp_torchrl import HybridDynamics, get_task
 from phihp_torchrl.agents import Actor, TwinQ
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.evaluation import EVALUATION_SEED
 from phihp_torchrl.planners.factory import PlannerConfig
+from phihp_torchrl.trainers import read_request
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 TINY = PlannerConfig(
@@ -24,11 +26,18 @@ TINY = PlannerConfig(
 
 
 @pytest.fixture
-def recipe(tmp_path, monkeypatch):
+def module(monkeypatch):
+    """The recipe as it is, reading and writing what is committed."""
     monkeypatch.syspath_prepend(str(RECIPES))
     spec = importlib.util.spec_from_file_location("pareto_recipe", RECIPES / "pareto.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def recipe(module, tmp_path, monkeypatch):
+    """The recipe on a small agent, writing elsewhere."""
     task = replace(get_task("pendulum"), max_steps=2)
     parts = {"actor": Actor(task, (4,)), "qvalue": TwinQ(task, (4,)), "planner_config": TINY}
     agent = Agent(task, dynamics=HybridDynamics.hybrid(task), **parts)
@@ -81,12 +90,14 @@ def test_the_choice_never_sees_an_evaluation_seed(recipe, monkeypatch, capsys):
     assert len(seeds) == len(recipe.BUDGETS)
     assert (recipe.RESULTS / "pareto.png").is_file()
     # The report plays the two that it compares once each.
-    monkeypatch.setattr(sys, "argv", ["pareto.py", "--report", "--calls", "10"])
+    monkeypatch.setattr(
+        sys, "argv", ["pareto.py", "--report", "--tasks", "pendulum", "--calls", "10"]
+    )
     seeds.clear()
     recipe.main()
     assert seeds == [EVALUATION_SEED] * 2
     results = json.loads((recipe.RESULTS / "pareto.json").read_text())
-    assert results["report"]["chosen"] in recipe.BUDGETS
+    assert results["report"]["rows"]["pendulum"]["chosen"] in recipe.BUDGETS
     assert list(results["origins"]) == ["pendulum"]
     assert "On evaluation seeds" in (recipe.RESULTS / "README.md").read_text()
     assert torch.get_num_threads() == 1
@@ -107,3 +118,13 @@ def test_tasks_swept_before_stay(recipe, monkeypatch):
     assert swept(["published", "cheap"], "acrobot") == ["acrobot"]
     assert swept(["published", "cheap"], "pendulum") == ["acrobot", "pendulum"]
     assert swept(["published", "cheap", "new"], "pendulum") == ["pendulum"]
+
+
+@pytest.mark.parametrize("task", ["acrobot", "pendulum-swingup"])
+def test_the_fast_budget_is_what_the_sweep_chose(module, task):
+    swept = json.loads((RECIPES.parent / module.RESULTS / "pareto.json").read_text())
+    chosen = module.choose(swept["tasks"])
+    lines = [f"task={task}", "budget=fast"]
+    with initialize_config_dir(str(RECIPES / "config"), version_base="1.3"):
+        fast = read_request(compose("phihp", lines), lines).config.planner
+    assert fast == module.planner_config(task, chosen)
