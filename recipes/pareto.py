@@ -132,7 +132,7 @@ def difference(rows: dict, name: str):
 
 
 def loses(rows: dict, name: str) -> bool:
-    """Whether a budget earns less than the published one, by more than chance and ``NEGLIGIBLE``."""
+    """Whether a budget earns less than the published one, by more than chance or `NEGLIGIBLE`."""
     gap, published = difference(rows, name), torch.tensor(rows[PUBLISHED]["returns"]).mean()
     return -gap.mean > max(gap.standard_error, NEGLIGIBLE * abs(published.item()))
 
