@@ -80,8 +80,9 @@ def machine_text(origin: Mapping[str, Any]) -> str:
         '2 cores, 24 GiB, 0 GPUs'
     """
     machine = origin["machine"]
-    memory = "unknown" if machine["memory_gib"] is None else f"{machine['memory_gib']:.0f} GiB"
-    return f"{machine['cpus']} cores, {memory}, {machine['gpus']} GPUs"
+    memory = machine["memory_gib"]  # not every system tells
+    size = "memory unknown" if memory is None else f"{memory:.0f} GiB"
+    return f"{machine['cpus']} cores, {size}, {machine['gpus']} GPUs"
 
 
 def _memory_gib() -> float | None:

@@ -42,6 +42,7 @@ AGENTS, RESULTS = Path("results/agents"), Path("results/pareto")
 TURN = 10  # actions of a planner before the next one's
 NEGLIGIBLE = 0.0025  # share of the published budget's return
 SWEEP_SEED = 0  # of training: the choice must not see an evaluation seed
+REPORT_EPISODES = 50
 BUDGETS = {
     "220 x 3, published": {},
     "64 x 2": {"num_candidates": 64, "optim_steps": 2, "num_kept_elites": 2},
@@ -154,10 +155,10 @@ def report(task: str, chosen: str, calls: int, before: dict[str, Any]) -> dict[s
     fast = build(agent, chosen, compile=True)
     planners = {"published, eager": build(agent, PUBLISHED), "chosen, compiled": fast}
     milliseconds = latencies(planners, agent, calls)
-    same = description(agent, chosen, EVALUATION_SEED, 50)
+    same = description(agent, chosen, EVALUATION_SEED, REPORT_EPISODES)
     if any(before.get(key) != value for key, value in same.items()):
         ours, theirs = (
-            evaluate(build(agent, name), agent.task, episodes=50, seed=EVALUATION_SEED)
+            evaluate(build(agent, name), agent.task, episodes=REPORT_EPISODES, seed=EVALUATION_SEED)
             for name in (chosen, PUBLISHED)
         )
         paired = paired_difference(ours.returns, theirs.returns)
@@ -232,8 +233,8 @@ def write(results: dict) -> None:
             for task, row in reported["rows"].items()
         ]
         text += (
-            "\n## On evaluation seeds\n\n`python recipes/pareto.py --report`: 50 paired "
-            f"episodes.\n\n{markdown_table(header, lines)}\n"
+            "\n## On evaluation seeds\n\n`python recipes/pareto.py --report`: "
+            f"{REPORT_EPISODES} paired episodes.\n\n{markdown_table(header, lines)}\n"
             f"{origins({task: row['origin'] for task, row in reported['rows'].items()})}"
         )
     (RESULTS / "README.md").write_text(text)

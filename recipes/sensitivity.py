@@ -99,7 +99,6 @@ def candidates(own: PlannerConfig, actors: int, random: int) -> PlannerConfig:
         top_k=elites,
         num_kept_elites=min(own.num_kept_elites, elites),
         warm_start=own.warm_start and random > 0,  # random candidates start from the last plan
-        compare_with_actor=own.compare_with_actor and actors > 0,
     )
 
 
