@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from phihp_torchrl.compilation import compile_graph
 
-LARGE, SMALL = 96, 8  # a product of three LARGE sides goes to oneDNN
+LARGE, SMALL = 192, 8  # a product of three LARGE sides goes to oneDNN
 CALL = "phihp_torchrl.linear.default("
 
 
@@ -66,6 +66,37 @@ def test_every_function_has_its_own_graphs():
         for size in range(2, 2 + 2 * torch._dynamo.config.recompile_limit):
             compiled = compile_graph(scale, backend="eager")
             assert compiled(torch.ones(size)).tolist() == [2.0] * size
+
+
+def test_a_graph_fits_its_arguments_and_the_modes_of_modules():
+    dropout = torch.nn.Dropout(1.0)
+    compiled = compile_graph(lambda x, sign=1: sign * dropout(x), backend="eager")
+    ones = torch.ones(2)
+    assert compiled(ones).tolist() == [0.0, 0.0]
+    dropout.eval()
+    assert compiled(ones).tolist() == [1.0, 1.0]
+    assert compiled(ones, sign=-1).tolist() == [-1.0, -1.0]
+    assert compiled(ones.double()).dtype == torch.float64
+
+
+def test_weights_may_change_and_be_replaced():
+    layer = torch.nn.Linear(2, 2)
+    compiled = compile_graph(layer.forward, backend="eager")
+    x = torch.randn(3, 2)
+    compiled(x)
+    for change in (
+        lambda: layer.weight.data.mul_(2),
+        lambda: setattr(layer, "weight", torch.nn.Parameter(torch.randn(2, 2))),
+    ):
+        change()
+        assert compiled(x).equal(layer(x))
+
+
+def test_options_are_added_to_ours():
+    x = torch.randn(LARGE, LARGE)
+    compiled = compile_graph(torch.mm, options={"epilogue_fusion": False})
+    _, code = run_and_get_code(compiled, x, x)
+    assert CALL in code[0]
 
 
 def test_a_graph_that_would_break_fails():

@@ -77,6 +77,7 @@ def plan(
                 again = index[: s.num_kept_elites] == 0
                 kept = Pool(kept.actions, kept.scores.masked_fill(again, BAD))
         center, std = _refit(elites, center, std, s.min_std * bounds.scale)
+        center = bounds.clip(center)  # where rounding takes a mean of bounds out of them
 
     assert best is not None  # there is at least one iteration
     chosen = best if s.select == "best" else Pool(center, best.scores)

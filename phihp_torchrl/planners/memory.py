@@ -50,7 +50,7 @@ class PlanMemory:
             return self._plans[..., 0, :]
         plans, age = self._plans, self._age
         if plans is None or age is None or not self._fits(cold):
-            plans = plan(cold if self.warm_start else None)
+            plans = plan(self.recall(is_init, cold) if self.warm_start else None)
             age = torch.zeros(batch, dtype=torch.long, device=plans.device)
         else:
             age = age + 1
@@ -73,7 +73,7 @@ class PlanMemory:
             cold: what comes after its end, and in its place where there is none.
         """
         if self._plans is None or not self._fits(cold):
-            return cold
+            return cold.contiguous()  # like all that follow: other strides are another graph
         rest = self._plans[..., self.replan_every :, :]
         mean = torch.cat([rest, cold[..., : self.replan_every, :]], -2)
         return mean if is_init is None else torch.where(is_init[..., None, None], cold, mean)
