@@ -47,6 +47,12 @@ BUDGETS = {
     "220 x 3, published": {},
     "64 x 2": {"num_candidates": 64, "optim_steps": 2, "num_kept_elites": 2},
     "32 x 2": {"num_candidates": 32, "optim_steps": 2, "num_kept_elites": 2},
+    "32 x 2, 3 actions ahead": {
+        "num_candidates": 32,
+        "optim_steps": 2,
+        "num_kept_elites": 2,
+        "planning_horizon": 3,
+    },
     "96 x 1": {"num_candidates": 96},
     "64 x 1": {"num_candidates": 64},
     "32 x 1": {"num_candidates": 32},
