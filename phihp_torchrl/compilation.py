@@ -20,8 +20,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _aten = torch.ops.aten
-# Multiplications below which oneDNN's call costs more than its kernel saves: 32 rows through a layer
-# of 300 units are faster by the BLAS, 64 by oneDNN.
+# Multiplications below which oneDNN's call costs more than its kernel saves: 32 rows through a
+# layer of 300 units are faster by the BLAS, 64 by oneDNN.
 _FEWEST = 2**22
 
 torch.library.define(
