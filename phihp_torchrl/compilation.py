@@ -52,7 +52,7 @@ def compile_graph(
 
     Whether a graph still fits is asked of the arguments at each call, and of the modules' modes of
     training, but not of all else that the function closes over: to look through hundreds of
-    attributes takes a tenth of a fast plan.
+    attributes takes a good part of a small plan's time.
 
     Args:
         function: what to compile. What it closes over is a constant of the graph, except tensors

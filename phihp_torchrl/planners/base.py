@@ -233,8 +233,8 @@ class SamplingPlanner(MPCPlannerBase):
         self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None
     ) -> TensorDictBase:
         """Plan, and write the action."""
-        # The stock one looks for pandas on the disk whenever it writes, a tenth of a fast plan, and
-        # projects what is in bounds already.
+        # The stock one looks for pandas on the disk whenever it writes, and projects what a plan
+        # has in bounds already.
         out = tensordict if tensordict_out is None else tensordict_out
         return out.set(self.action_key, self.planning(tensordict))
 
