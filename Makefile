@@ -43,8 +43,8 @@ types: $(STAMP) ## mypy alone
 docs: $(DOCS_STAMP) ## build the documentation into site/
 	$(BIN)/python -m mkdocs build --strict
 
-bench: $(STAMP) ## time the hot paths (benchmarks/)
-	$(ONE_THREAD) $(HEADLESS) $(BIN)/python -m pytest benchmarks --benchmark-only $(ARGS)
+bench: $(STAMP) ## time the hot paths (benchmarks/speed/)
+	$(ONE_THREAD) $(HEADLESS) $(BIN)/python -m pytest benchmarks/speed --benchmark-only $(ARGS)
 
 clean: ## remove .venv, caches and build products (results/ and outputs/ stay)
 	rm -rf $(VENV) build dist site *.egg-info

@@ -13,7 +13,7 @@ from race import figures
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
 
-RESULTS = Path(__file__).parent.parent / "results" / "benchmarks"
+RESULTS = Path(__file__).parents[2] / "results" / "benchmarks"
 HEAD = (
     "# Benchmarks\n\n"
     "Made by `make bench`, which replaces the tables of the benchmarks that it ran. Contenders "

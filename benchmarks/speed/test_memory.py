@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-RECIPE = Path(__file__).parent.parent / "recipes" / "phihp.py"
+RECIPE = Path(__file__).parents[2] / "recipes" / "phihp.py"
 LIMIT = 1.5e9
 # What a run allocates does not depend on how long it learns: the replay is there from the start.
 SHORT = ["policy.updates=1000", "evaluate.latency_actions=20", "evaluate.video=false"]
