@@ -19,28 +19,16 @@ from phihp_torchrl.deployment import Agent
 from phihp_torchrl.envs import make_task_env
 from phihp_torchrl.evaluation import (
     EVALUATION_SEED,
-    PREDICTION_EPISODES,
-    PREDICTION_STEPS,
-    PUBLISHED,
-    PUBLISHED_SAMPLES,
-    TARGETS,
     TaskResult,
     check_training_seed,
-    curve_from_metrics,
     episode_figure,
     evaluate,
     evaluation_seed,
-    learning_curve,
     markdown_table,
     mean_and_std,
     measure_latency,
-    paired_difference,
     play_episode,
-    prediction_errors,
-    read_curve,
     returns_table,
-    unseen_episodes,
-    write_curve,
     write_gif,
 )
 from phihp_torchrl.planners.factory import PlannerConfig
@@ -212,20 +200,6 @@ def test_bad_arguments_are_named():
         play_episode(constant(), "cartpole", frames_per_second=0)
 
 
-def test_paired_difference():
-    a, b = torch.tensor([3.0, 5.0, 4.0]), torch.tensor([1.0, 1.0, 1.0])
-    difference = paired_difference(a, b)
-    assert difference.mean == pytest.approx(3.0)
-    assert difference.standard_error == pytest.approx(1 / math.sqrt(3))
-    assert not difference.is_worse
-    assert paired_difference(b, a).is_worse
-    assert not paired_difference(a, a).is_worse
-    assert not paired_difference(torch.tensor([0.0, 9.0]), torch.tensor([1.0, 9.0])).is_worse
-    for bad in (torch.ones(2), torch.ones(3, 1)):
-        with pytest.raises(ValueError, match="returns_a, returns_b: expected"):
-            paired_difference(a, bad)
-
-
 # Seeds
 
 
@@ -355,34 +329,7 @@ def test_episode_figure(name, tmp_path):
     assert np.asarray(Image.open(tmp_path / "episode.png").convert("L")).std() > 5
 
 
-def test_learning_curve(tmp_path):
-    one = ([0, 100, 200], [0.0, 1.0, 2.0])
-    two = ([0, 100, 300], [2.0, 3.0, 5.0])
-    figure = learning_curve({"PhIHP": [one, two]}, reference={"paper": 1.5}, title="pendulum")
-    axis = figure.axes[0]
-    mean = axis.lines[2]
-    assert mean.get_xdata().tolist() == [0, 100, 200]
-    assert mean.get_ydata().tolist() == [1.0, 2.0, 3.0]
-    assert axis.get_xscale() == "linear"
-    wide = learning_curve({"a": [([10, 1000], [0, 1])], "b": [([], [])]})
-    assert wide.axes[0].get_xscale() == "symlog"
-    for i, drawn in enumerate((figure, wide, learning_curve({}))):
-        drawn.savefig(tmp_path / f"{i}.png")
-
-
 # Tables
-
-
-def test_published_numbers_fit_together():
-    assert set(PUBLISHED) <= set(PUBLISHED_SAMPLES) <= set(list_tasks())
-    assert set(TARGETS) < set(PUBLISHED_SAMPLES)
-    for task, row in PUBLISHED.items():
-        assert set(row) == {"PhIHP", "TD-MPC", "TD3", "CEM-oracle"}
-        assert row["PhIHP"].samples * 1000 == PUBLISHED_SAMPLES[task]
-    assert PUBLISHED["acrobot-swingup"]["PhIHP"][:2] == (371, 52)
-    assert "cartpole-swingup" not in PUBLISHED, "its reward is another than the published one"
-    with pytest.raises(TypeError):
-        PUBLISHED["pendulum"] = {}
 
 
 def test_tables():
@@ -402,46 +349,3 @@ def test_tables():
         ["cartpole-swingup", "2", "500", "–", "405.0 ± 7.1", "420", "–", "–"],
     ]
     assert mean_and_std([-1.25, -1.75], 2) == "−1.50 ± 0.35"
-
-
-def test_a_curve_is_every_evaluation_in_the_real_world(tmp_path):
-    row = {"phase": "policy", "real_steps": "60", "seconds": "1.5"}
-    rows = [
-        {**row, "phase": "model", "collect/reward": "-1"},
-        {**row, "policy/updates": "10", "policy/imagined_steps": "640", "policy/real_return": "-9"},
-        {**row, "policy/updates": "20", "policy/real_return": "-inf"},
-        {**row, "td3/updates": "30", "return_mean": "-8", "return_std": "2", "loss": ""},
-        {**row, "tdmpc/planner_return": "-7", "tdmpc/actor_return": "-6",
-         "tdmpc/episode_return": "0"},
-        {**row, "evaluate/planner/return_mean": "-5", "evaluate/planner/return_std": "1",
-         "evaluate/planner/episodes": "50", "evaluate/actor/return_mean": ""},
-    ]  # fmt: skip
-    curve = curve_from_metrics(rows)
-    assert [(p.acting, p.return_mean, p.updates) for p in curve[1:]] == [
-        ("actor", -8, 30),
-        ("planner", -7, 30),
-        ("actor", -6, 30),
-        ("planner", -5, 30),
-    ]
-    assert (curve[0].return_mean, curve[0].updates, curve[0].imagined_steps) == (-9, 10, 640)
-    assert (curve[1].return_std, curve[4].return_std, curve[4].episodes) == (2, 1, 50)
-    assert math.isnan(curve[2].return_std)
-    write_curve(tmp_path / "curve.csv", curve)
-    assert str(read_curve(tmp_path / "curve.csv")) == str(curve)  # NaN is not NaN
-    (tmp_path / "curve.csv").write_text("real_steps,return_mean\n1,2\n")
-    with pytest.raises(ValueError, match=r"curve\.csv: expected the columns"):
-        read_curve(tmp_path / "curve.csv")
-
-
-def test_predictions_are_judged_on_states_of_their_own():
-    task = get_task("acrobot")
-    start, actions, end = unseen_episodes(task, "coverage")
-    assert start.shape == end.shape == (PREDICTION_EPISODES, 4)
-    assert actions.shape == (PREDICTION_EPISODES, PREDICTION_STEPS, 1)
-    assert torch.equal(start, unseen_episodes(task, "coverage").start)
-    right = prediction_errors(task, HybridDynamics.oracle(task))
-    wrong = prediction_errors(task, HybridDynamics.hybrid(task))
-    assert right["reset_mean"] < 1e-4 < wrong["reset_mean"]
-    assert right["coverage_median"] < 1e-2 < wrong["coverage_median"]
-    with pytest.raises(ValueError, match="where: expected a box"):
-        unseen_episodes(task, "nowhere")

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from cluster_check import TINY
 from phihp_torchrl.deployment import load_agent
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 SMALL = (
-    *runpy.run_path(str(RECIPES / "cluster_check.py"))["TINY"],
+    *TINY,
     "progress=false",
     "model.real_steps=60",
     "model.steps_per_iteration=30",

@@ -1,0 +1,70 @@
+"""What is kept of a finished run: small text files, enough for every table and figure."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import os
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+from grid.cell import CellFiles
+from measures import curve_from_metrics, prediction_errors, write_curve
+from phihp_torchrl.deployment import load_agent
+
+_log = logging.getLogger(__name__)
+
+CELL = "cell.json"
+CURVE = "curve.csv"
+PREDICTION = "prediction.json"
+_COPIED = ("config.yaml", "metadata.json", "metrics.csv")
+
+
+def keep(files: CellFiles) -> None:
+    """Copy the small files of a finished run, and derive what they do not say.
+
+    ``evaluation.json`` comes last, for it marks the cell as done. Called again, it adds what an
+    earlier version did not write.
+    """
+    files.kept.mkdir(parents=True, exist_ok=True)
+    for name in _COPIED:
+        _replace(files.run / name, files.kept / name)
+    with (files.run / "metrics.csv").open(newline="") as file:
+        points = curve_from_metrics(csv.DictReader(file))
+    write_curve(files.run / CURVE, points)
+    _replace(files.run / CURVE, files.kept / CURVE)
+    (files.run / CELL).write_text(json.dumps(asdict(files.cell), indent=2) + "\n")
+    _replace(files.run / CELL, files.kept / CELL)
+    _keep_prediction(files)
+    _replace(files.run / "evaluation.json", files.evaluation)
+
+
+def is_whole(files: CellFiles) -> bool:
+    """Whether everything is kept that can still be had."""
+    can_be_had = {CELL, CURVE} if (files.run / "evaluation.json").is_file() else set()
+    if (files.run / "agent").is_dir():
+        can_be_had.add(PREDICTION)
+    return all((files.kept / name).is_file() for name in can_be_had)
+
+
+def _keep_prediction(files: CellFiles) -> None:
+    """The errors of the run's model on states it has not seen, where it has a model."""
+    if not (files.run / "agent").is_dir():
+        return
+    try:
+        agent = load_agent(files.run / "agent")
+        errors = {} if agent.dynamics is None else prediction_errors(agent.task, agent.dynamics)
+    except Exception as error:  # a finished run must not be lost to an afterthought
+        _log.warning("%s: its model's predictions were not measured: %s", files.run, error)
+        return
+    (files.run / PREDICTION).write_text(json.dumps(errors, indent=2) + "\n")
+    _replace(files.run / PREDICTION, files.kept / PREDICTION)
+
+
+def _replace(source: Path, target: Path) -> None:
+    """Copy in one step: readers see the old file or the new."""
+    stage = target.with_name(f".{target.name}.stage")
+    shutil.copyfile(source, stage)
+    os.replace(stage, target)

@@ -1,0 +1,139 @@
+"""Work on one cell: skip, resume, run, keep; never twice, and no error lost."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import socket
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+
+import torch
+from hydra.core.global_hydra import GlobalHydra
+
+from grid.cell import CellFiles
+from grid.claim import claim
+from grid.config import GridConfig
+from grid.keep import is_whole, keep
+from grid.status import CellState, Status, look
+from phihp_torchrl.trainers import RunRequest, run
+from recipe_configs import compose_request
+
+_log = logging.getLogger(__name__)
+_LOGGERS = ("phihp_torchrl", "grid")
+
+
+def work(config: GridConfig, root: Path) -> CellState:
+    """Bring a cell to its end, unless it is there or another process is at it.
+
+    Args:
+        config: the cell.
+        root: directory that relative ones are in.
+
+    Returns:
+        Its state. An error of the run is a state too: it ends this cell, not the grid.
+
+    Raises:
+        KeyboardInterrupt: if a signal asked the run to stop; its checkpoint is written.
+    """
+    files = config.files(root)
+    if look(files).status is Status.DONE and is_whole(files):
+        return look(files)
+    with claim(files.lock, config.claim_wait) as ours:
+        # Only now: another process may have finished the cell, or failed at it, meanwhile.
+        if ours and files.evaluation.is_file():
+            if not is_whole(files):
+                keep(files)
+        elif ours and (config.retry_failed or not files.failure.is_file()):
+            with _logged(files.log):
+                _run(config, files)
+    return look(files)
+
+
+def _run(config: GridConfig, files: CellFiles) -> None:
+    files.failure.unlink(missing_ok=True)
+    # Cells of one process share compiled code, and dynamo counts how often a function is compiled.
+    torch.compiler.reset()
+    try:
+        request = _request(config, files)
+        _log.info("%s", "resumed" if request.resume else "started")
+        result = run(request.config, request.path, resume=request.resume)
+        if result.finished:
+            keep(files)
+            _log.info("finished")
+    except Exception as error:
+        _log.exception("failed")
+        record = {
+            "error": " ".join(f"{type(error).__name__}: {error}".split()),
+            "traceback": traceback.format_exc(),
+            "host": socket.gethostname(),
+            "when": datetime.now().astimezone().isoformat(timespec="seconds"),
+        }
+        files.failure.write_text(json.dumps(record, indent=2) + "\n")
+        return
+    if not result.finished:
+        _log.info("stopped by signal %s", result.signal)
+        raise KeyboardInterrupt
+
+
+def _request(config: GridConfig, files: CellFiles) -> RunRequest:
+    """What ``python recipes/<recipe>.py`` would be asked for."""
+    cell, how = files.cell, config.how
+    lines = [f"task={cell.task}", f"seed={cell.seed}", "progress=false"]
+    if cell.samples is not None:
+        lines.append(f"{how.samples_key}={cell.samples}")
+    # Overrides hold for a resumed run too, which refuses to be another one than it was.
+    lines += [*how.overrides, *config.overrides]
+    if (files.run / "config.yaml").is_file():
+        lines.append(f"resume={_quoted(files.run)}")
+    else:
+        # Killed before its first file was whole: there is nothing to lose in it.
+        shutil.rmtree(files.run, ignore_errors=True)
+        lines.append(f"run_dir={_quoted(files.run)}")
+    with _no_hydra():
+        return compose_request(how.recipe, lines)
+
+
+def _quoted(path: Path) -> str:
+    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
+    return f"'{text}'"
+
+
+@contextmanager
+def _no_hydra() -> Iterator[None]:
+    """Hydra knows one application at a time: set the grid's aside while a recipe's is composed."""
+    instance = GlobalHydra.instance()
+    outer = instance.hydra
+    instance.clear()
+    try:
+        yield
+    finally:
+        instance = GlobalHydra.instance()
+        instance.clear()
+        if outer is not None:
+            instance.initialize(outer)
+
+
+@contextmanager
+def _logged(path: Path) -> Iterator[None]:
+    """All messages of the package and of the grid go to ``path``, and none to the terminal."""
+    loggers = [logging.getLogger(name) for name in _LOGGERS]
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    before = [(logger.level, logger.propagate) for logger in loggers]
+    for logger in loggers:
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
+        logger.propagate = False
+    try:
+        yield
+    finally:
+        for logger, (level, propagate) in zip(loggers, before, strict=True):
+            logger.setLevel(level)
+            logger.propagate = propagate
+            logger.removeHandler(handler)
+        handler.close()

@@ -1,0 +1,44 @@
+"""From folders of runs to the paper's tables and figures."""
+
+from __future__ import annotations
+
+from report.bounds import BOUNDS, Bounds, normalise
+from report.build import Report, ReportConfig, make_report
+from report.efficiency import samples_to_90
+from report.paper_systems import SYSTEMS, PaperSystem
+from report.results import Results, Score
+from report.runs import Acting, Run, RunFolders, read_run, read_runs
+from report.sections import Picture, Section
+from report.sensitivity import Trial, read_trials, write_trials
+from report.significance import Welch, welch
+from report.tables import NOT_RUN, Number, Stat, Table
+
+__all__ = [
+    "BOUNDS",
+    "NOT_RUN",
+    "SYSTEMS",
+    "Acting",
+    "Bounds",
+    "Number",
+    "PaperSystem",
+    "Picture",
+    "Report",
+    "ReportConfig",
+    "Results",
+    "Run",
+    "RunFolders",
+    "Score",
+    "Section",
+    "Stat",
+    "Table",
+    "Trial",
+    "Welch",
+    "make_report",
+    "normalise",
+    "read_run",
+    "read_runs",
+    "read_trials",
+    "samples_to_90",
+    "welch",
+    "write_trials",
+]

@@ -1,0 +1,65 @@
+"""The ablation: what each part of PhIHP is worth, on the three metrics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import product
+
+from matplotlib.figure import Figure
+
+from report.efficiency import sample_efficiency
+from report.paper_systems import ABLATIONS, PHIHP, PaperSystem
+from report.results import SIX_TASKS, Results
+from report.sections import Picture, Section
+from report.tables import Stat, Table, TableCell
+
+_SYSTEMS = (PHIHP, *ABLATIONS)
+
+
+def ablation(results: Results) -> Section:
+    """Bars over the tasks that all systems which were run have in common, and a table of all."""
+    run = [s for s in _SYSTEMS if any(results.has_run(s, task) for task in SIX_TASKS)]
+    common = [task for task in SIX_TASKS if run and all(results.has_run(s, task) for s in run)]
+    metrics: dict[str, Callable[[PaperSystem, str], Sequence[float]]] = {
+        "normalised return": lambda s, t: [x.normalised for x in results.usual(s, t)],
+        "real samples to 90 %": lambda s, t: sample_efficiency(results, s, t),
+        "ms for an action": lambda s, t: [
+            x.milliseconds for x in results.usual(s, t) if x.milliseconds is not None
+        ],
+    }
+    missing = [system.name for system in _SYSTEMS if system not in run]
+    shared = ", ".join(common) or "no task, for none is shared"
+    text = f"Bars: mean ± std over the runs on {shared}."
+    if missing:
+        text += f" Not run: {', '.join(missing)}."
+    digits = (3, 0, 2)
+    rows: list[list[TableCell]] = []
+    for task, system in product(SIX_TASKS, _SYSTEMS):
+        stats = [
+            Stat(tuple(values(system, task)), n)
+            for values, n in zip(metrics.values(), digits, strict=True)
+        ]
+        rows.append([f"{task}, {system.name}", *stats])
+    figure = Figure(figsize=(11.0, 3.4), layout="constrained")
+    for axis, (name, values) in zip(figure.subplots(1, len(metrics)), metrics.items(), strict=True):
+        for x, system in enumerate(_SYSTEMS):
+            stat = Stat(tuple(v for task in common for v in values(system, task)))
+            if system in run and stat.values:
+                columns = stat.columns()
+                mean, std = float(columns[" mean"]), float(columns[" std"])
+                axis.bar(x, mean, yerr=0.0 if math.isnan(std) else std, color=f"C{x}", capsize=3)
+            else:
+                axis.text(x, 0.05, "not run", rotation=90, ha="center", va="bottom",
+                          transform=axis.get_xaxis_transform())  # fmt: skip
+        names = [system.name for system in _SYSTEMS]
+        axis.set_xticks(range(len(names)), names, rotation=30, fontsize="small")
+        axis.set_xlim(-0.6, len(names) - 0.4)
+        axis.set_title(name)
+        axis.grid(axis="y", alpha=0.3)
+    return Section(
+        "Ablation",
+        text,
+        {"By task": Table("ablation", ["task, system", *metrics], rows)},
+        [Picture("ablation", figure, "PhIHP and its variants on the three metrics.")],
+    )

@@ -1,0 +1,125 @@
+"""A report from folders of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from phihp_torchrl.ranges import check_count
+from report.ablation import ablation
+from report.claims import claims_section
+from report.curves import imagined_curves, learning_curves
+from report.generalization import generalization
+from report.main_table import main_table
+from report.over_runs import aggregate_section
+from report.overview import fill_page, origins, overview
+from report.planner_and_actor import acting_section
+from report.results import Results
+from report.runs import read_runs
+from report.sections import Section
+from report.sensitivity import read_trials, sensitivity
+from report.significance import significance
+from report.time_to_return import time_to_return
+from report.write import write_report
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """Where a report comes from and goes; ``config/report.yaml`` mirrors it.
+
+    Args:
+        runs: directory with a folder for each run.
+        sensitivity: directory of ``sensitivity.py``'s data.
+        benchmarks: what ``make bench`` wrote.
+        out: directory of the report.
+        label: the settings whose runs it is on.
+        any_version: whether to take runs of other versions of this package.
+        reps: resamples of the bootstrap.
+        overview: page with PhIHP's tables for every label; ``None`` for none.
+        page: page with the table of returns between its markers; ``None`` for none.
+    """
+
+    runs: str = "results/runs"
+    sensitivity: str = "results/sensitivity"
+    benchmarks: str = "results/benchmarks/benchmarks.json"
+    out: str = "results/report"
+    label: str = "default"
+    any_version: bool = False
+    reps: int = 2000
+    overview: str | None = "results/README.md"
+    page: str | None = "README.md"
+
+    def __post_init__(self) -> None:
+        check_count(self, "reps")
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report that was made.
+
+    Args:
+        sections: its parts.
+        problems: a sentence for each folder that was left out, and each part that could not be
+            made.
+    """
+
+    sections: tuple[Section, ...]
+    problems: tuple[str, ...]
+
+
+def make_report(config: ReportConfig) -> Report:
+    """Make all of a report that can be made, and write it.
+
+    Args:
+        config: from where and to where.
+    """
+    folders = read_runs(Path(config.runs), any_version=config.any_version)
+    trials, unread = read_trials(Path(config.sensitivity))
+    problems = [*folders.problems, *unread]
+    chosen = [run for run in folders.runs if run.label == config.label]
+    results = Results(chosen)
+    sections = [
+        _make("The paper's claims", lambda: claims_section(results), problems),
+        _make("Main table", lambda: main_table(results), problems),
+        _make("Learning curves", lambda: learning_curves(results), problems),
+        _make("Performance over runs", lambda: aggregate_section(results, config.reps), problems),
+        _make("Welch's t-tests", lambda: significance(results), problems),
+        _make("Ablation", lambda: ablation(results), problems),
+        _make("Generalization", lambda: generalization(results), problems),
+        _make("TD3 in imagination", lambda: imagined_curves(results), problems),
+        _make("Sensitivity", lambda: sensitivity(trials), problems),
+        _make("PhIHP, planner and actor", lambda: acting_section(chosen), problems),
+        _make(
+            "From nothing to the published return",
+            lambda: time_to_return(chosen, Path(config.benchmarks)),
+            problems,
+        ),
+    ]
+    if problems:
+        sections.append(_left_out(problems))
+    introduction = (
+        f"Made by `python benchmarks/paper/make_report.py` from `{config.runs}`, label "
+        f"`{config.label}`. Do not edit. `docs/evaluation.md` defines each metric. "
+        + (origins(chosen) if chosen else "There are no runs with that label.")
+    )
+    write_report(Path(config.out), "Report", introduction, sections)
+    if config.overview is not None:
+        Path(config.overview).parent.mkdir(parents=True, exist_ok=True)
+        Path(config.overview).write_text(overview(folders.runs))
+    if config.page is not None and chosen:
+        fill_page(Path(config.page), chosen)
+    return Report(tuple(sections), tuple(problems))
+
+
+def _make(title: str, make: Callable[[], Section], problems: list[str]) -> Section:
+    """A section, or a word on why it could not be made."""
+    try:
+        return make()
+    except ImportError as error:  # of the extra `report`
+        problems.append(f"{title}: not made: {error}")
+        return Section(title, f"Not made: {error}")
+
+
+def _left_out(problems: Sequence[str]) -> Section:
+    return Section("Left out", "\n".join(f"- {problem}" for problem in problems))

@@ -1,0 +1,72 @@
+"""The paper's main table: return, sample efficiency and time of an action, beside the published."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from phihp_torchrl.evaluation import PUBLISHED, Published
+from report.efficiency import sample_efficiency
+from report.paper_systems import BASELINES, PHIHP, PaperSystem
+from report.results import TASKS, Results
+from report.sections import Section
+from report.tables import Stat, Table, TableCell
+
+_COLUMNS = (PHIHP, *BASELINES)
+
+
+def main_table(results: Results) -> Section:
+    """A table for each of the three metrics."""
+
+    def returns(system: PaperSystem, task: str) -> Stat:
+        return Stat(tuple(score.mean for score in results.usual(system, task)))
+
+    def samples(system: PaperSystem, task: str) -> Stat:
+        return Stat(sample_efficiency(results, system, task), 0)
+
+    def milliseconds(system: PaperSystem, task: str) -> Stat:
+        times = (score.milliseconds for score in results.usual(system, task))
+        return Stat(tuple(time for time in times if time is not None), 2)
+
+    return Section(
+        "Main table",
+        "Mean ± std over seeds (number of seeds); under *published*, the paper's numbers, mean ± "
+        "std over 10 runs, times on an Apple M1. The paper's CartPoleSwingup is "
+        "`cartpole-swingup-published`. Returns and times are those at the default preset's "
+        "number of real samples, or at the most where there is no such run.",
+        {
+            "Return": _table("main_return", returns, _published_return),
+            "Real samples to 90 % of the best return": _table(
+                "main_samples", samples, _published_samples
+            ),
+            "Milliseconds for an action, mean": _table(
+                "main_milliseconds", milliseconds, _published_milliseconds
+            ),
+        },
+    )
+
+
+def _table(
+    name: str, ours: Callable[[PaperSystem, str], TableCell], theirs: Callable[[Published], str]
+) -> Table:
+    header, rows = ["task"], []
+    for system in _COLUMNS:
+        header += [system.name, f"{system.name}, published"]
+    for task in TASKS:
+        row: list[TableCell] = [task]
+        for system in _COLUMNS:
+            published = PUBLISHED.get(task, {}).get(system.name)
+            row += [ours(system, task), "–" if published is None else theirs(published)]
+        rows.append(row)
+    return Table(name, header, rows)
+
+
+def _published_return(published: Published) -> str:
+    return f"{published.return_mean:.0f} ± {published.return_std:.0f}".replace("-", "−")
+
+
+def _published_samples(published: Published) -> str:
+    return "none" if published.samples is None else f"{1000 * published.samples:.0f}"
+
+
+def _published_milliseconds(published: Published) -> str:
+    return f"{published.milliseconds:g}"

@@ -1,0 +1,95 @@
+"""The scores of each system on each task, out of all runs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+
+from measures import DEFAULT_SAMPLES, PUBLISHED_SAMPLES
+from phihp_torchrl.evaluation import TARGETS
+from report.bounds import normalise
+from report.paper_systems import PaperSystem
+from report.runs import Acting, Run
+
+TASKS = tuple(PUBLISHED_SAMPLES)
+"""The tasks in the paper's order, the published variant of CartPoleSwingup among them."""
+
+SIX_TASKS = tuple(TARGETS)
+"""The six tasks that averages are over."""
+
+
+def usual_samples(task: str, numbers: Collection[int]) -> int:
+    """The number of real samples to compare at: the default preset's if it is there, or the most.
+
+    Examples:
+        >>> usual_samples("pendulum", [200, 1000, 2000]), usual_samples("pendulum", [200, 30_000])
+        (1000, 30000)
+    """
+    default = DEFAULT_SAMPLES.get(task)
+    return default if default is not None and default in numbers else max(numbers, default=0)
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a system earned in one run.
+
+    Args:
+        run: the run.
+        acting: how it acted: ``"planner"`` or ``"actor"``.
+    """
+
+    run: Run
+    acting: str
+
+    @property
+    def result(self) -> Acting:
+        """Its episodes and latency."""
+        return self.run.acting[self.acting]
+
+    @property
+    def mean(self) -> float:
+        """Mean return over its episodes."""
+        return self.result.mean
+
+    @property
+    def normalised(self) -> float:
+        """Mean return from 0 to 1."""
+        return normalise(self.run.task, self.mean)
+
+    @property
+    def milliseconds(self) -> float | None:
+        """Mean time of an action, if measured; where plans are remembered the median is not it."""
+        return self.result.latency.get("mean")
+
+
+class Results:
+    """Scores by system and task.
+
+    Args:
+        runs: all runs with one label.
+    """
+
+    def __init__(self, runs: Iterable[Run]) -> None:
+        self.runs = tuple(runs)
+
+    def scores(self, system: PaperSystem, task: str) -> list[Score]:
+        """All scores of a system on a task, one for each seed and number of samples."""
+        found: dict[tuple[int, int], Score] = {}
+        for method, wanted in system.sources:
+            for run in self.runs:
+                if (run.method, run.task) != (method, task):
+                    continue
+                acting = wanted or next(iter(run.acting))
+                if acting in run.acting:
+                    found.setdefault((run.samples, run.seed), Score(run, acting))
+        return [found[key] for key in sorted(found)]
+
+    def usual(self, system: PaperSystem, task: str) -> list[Score]:
+        """The scores at the usual number of real samples, by seed."""
+        scores = self.scores(system, task)
+        chosen = usual_samples(task, {score.run.samples for score in scores})
+        return [score for score in scores if score.run.samples == chosen]
+
+    def has_run(self, system: PaperSystem, task: str) -> bool:
+        """Whether there is a score."""
+        return bool(self.scores(system, task))

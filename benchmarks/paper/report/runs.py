@@ -1,0 +1,196 @@
+"""The runs behind a report, from their folders; a folder that is not fit is named, not fatal."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from grid.cell import DEFAULT_METHOD
+from measures import CurvePoint, curve_from_metrics, read_curve
+from phihp_torchrl.origin import commit_text, machine_text
+
+
+@dataclass(frozen=True)
+class Acting:
+    """What one way of acting earned in the last phase of a run.
+
+    Args:
+        returns: return of every episode.
+        latency: milliseconds for an action, by statistic (``"p50"``, …); empty if not measured.
+    """
+
+    returns: tuple[float, ...]
+    latency: Mapping[str, float]
+
+    @property
+    def mean(self) -> float:
+        """Mean return."""
+        return sum(self.returns) / len(self.returns)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Args:
+        folder: where it was read from.
+        method: name of its method.
+        task: name of its task.
+        label: name of its settings.
+        samples: real samples it was given.
+        seed: its seed.
+        kind: kind of its model; ``None`` for a method without one.
+        commit: abbreviated, with a ``+`` if the source had been changed.
+        machine: what it ran on.
+        seconds: time of each phase.
+        acting: by way of acting, ``"planner"`` or ``"actor"``.
+        curve: its evaluations in the real world, in their order.
+        prediction: errors of its model on states it had not seen; empty if not measured.
+    """
+
+    folder: Path
+    method: str
+    task: str
+    label: str
+    samples: int
+    seed: int
+    kind: str | None
+    commit: str
+    machine: str
+    seconds: Mapping[str, float]
+    acting: Mapping[str, Acting]
+    curve: tuple[CurvePoint, ...]
+    prediction: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class RunFolders:
+    """What a directory of runs holds.
+
+    Args:
+        runs: the finished runs.
+        problems: a sentence for each folder that was left out, with its name.
+    """
+
+    runs: tuple[Run, ...]
+    problems: tuple[str, ...]
+
+
+def read_runs(directory: Path, *, any_version: bool = False) -> RunFolders:
+    """Read all runs in ``directory``.
+
+    Args:
+        directory: it has a folder for each run.
+        any_version: take runs of other versions of this package too.
+    """
+    if not directory.is_dir():
+        return RunFolders((), (f"{directory}: expected a directory of runs, there is none.",))
+    runs, problems = [], []
+    for folder in sorted(path for path in directory.iterdir() if path.is_dir()):
+        try:
+            runs.append(read_run(folder, any_version=any_version))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
+            words = " ".join(str(error).split())
+            if isinstance(error, KeyError):
+                words = f"it does not say {words}"
+            problems.append(words if str(folder) in words else f"{folder}: left out: {words}")
+    if not runs and not problems:
+        problems.append(f"{directory}: no runs in it yet.")
+    return RunFolders(tuple(runs), tuple(problems))
+
+
+def read_run(folder: Path, *, any_version: bool = False) -> Run:
+    """Read the run in ``folder``.
+
+    Raises:
+        ValueError: if it is half written, of another version, or has returns that are no numbers.
+    """
+    if missing := [n for n in ("config.yaml", "metadata.json", "evaluation.json", "metrics.csv")
+                   if not (folder / n).is_file()]:  # fmt: skip
+        raise ValueError(f"the run is not finished: {', '.join(missing)} is missing.")
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    metadata = _read_json(folder / "metadata.json")
+    cell = _read_json(folder / "cell.json") if (folder / "cell.json").is_file() else {}
+    session = metadata["sessions"][0]
+    if not any_version:
+        _check_version(session["versions"]["phihp_torchrl"])
+    method, task = config.get("method", DEFAULT_METHOD), config["task"]
+    kind = (config.get("model") or {}).get("kind")
+    return Run(
+        folder=folder,
+        method=method,
+        task=task,
+        label=cell.get("label") or _label(folder.name, task, method),
+        samples=int(cell.get("samples") or metadata["real_steps"]),
+        seed=int(config["seed"]),
+        kind=kind,
+        commit=commit_text(session),
+        machine=machine_text(session),
+        seconds={str(k): float(v) for k, v in metadata["seconds"].items()},
+        acting=_acting(_read_json(folder / "evaluation.json")),
+        curve=_curve(folder),
+        prediction=_numbers(folder / "prediction.json"),
+    )
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    content = json.loads(path.read_text())
+    if not isinstance(content, dict):
+        raise ValueError(f"{path.name}: expected a JSON object.")
+    return content
+
+
+def _check_version(found: str) -> None:
+    try:
+        ours = version("phihp_torchrl")
+    except PackageNotFoundError:
+        return
+    if found != ours:
+        raise ValueError(
+            f"the run was made by phihp_torchrl {found}, this is {ours}; any_version=true takes it."
+        )
+
+
+def _label(name: str, task: str, method: str) -> str:
+    """The label in a cell's name, for runs from before there was a file that says it."""
+    rest = name.removeprefix(f"{task}-").removeprefix(f"{method}-")
+    found = re.fullmatch(r"(?:(.+?)-)?(?:n\d+-)?seed\d+", rest)
+    return (found and found[1]) or "default"
+
+
+def _acting(evaluation: Mapping[str, Any]) -> dict[str, Acting]:
+    if not evaluation:
+        raise ValueError("evaluation.json: expected returns, got none.")
+    acting = {}
+    for name, part in evaluation.items():
+        returns = tuple(float(value) for value in part["returns"])
+        bad = sum(not math.isfinite(value) for value in returns)
+        if bad or not returns:
+            raise ValueError(
+                f"evaluation.json: expected finite returns of the {name}, "
+                f"{bad} of {len(returns)} are not."
+            )
+        start = "latency_ms_"
+        latency = {k.removeprefix(start): float(v) for k, v in part.items() if k.startswith(start)}
+        acting[name] = Acting(returns, latency)
+    return acting
+
+
+def _curve(folder: Path) -> tuple[CurvePoint, ...]:
+    if (folder / "curve.csv").is_file():
+        return tuple(read_curve(folder / "curve.csv"))
+    with (folder / "metrics.csv").open(newline="") as file:
+        return tuple(curve_from_metrics(csv.DictReader(file)))
+
+
+def _numbers(path: Path) -> dict[str, float]:
+    return {k: float(v) for k, v in _read_json(path).items()} if path.is_file() else {}

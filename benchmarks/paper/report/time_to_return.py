@@ -1,0 +1,75 @@
+"""From nothing to the published return: seconds, beside those of the published updates."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from measures import PUBLISHED_UPDATES
+from phihp_torchrl.evaluation import PUBLISHED, TARGETS
+from report.planner_and_actor import both_ways
+from report.runs import Run
+from report.sections import Section
+from report.tables import Number, Stat, Table, TableCell
+
+_BENCHMARK = ("A TD3 update of 64 transitions", "fused step, compiled")
+
+
+def time_to_return(runs: Sequence[Run], benchmarks: Path) -> Section:
+    """PhIHP's seconds until it first earned what the paper's did (SPEC section 6).
+
+    Args:
+        runs: runs with one label.
+        benchmarks: what ``make bench`` wrote, for the time of a published update.
+    """
+    milliseconds = _update_milliseconds(benchmarks)
+    rows: list[list[TableCell]] = []
+    for (task, samples), group in both_ways(runs).items():
+        level = PUBLISHED[task]["PhIHP"].return_mean if task in PUBLISHED else TARGETS[task]
+        reached = [seconds for run in group if (seconds := seconds_to(run, level)) is not None]
+        whole = [run.seconds["model"] + run.seconds["policy"] for run in group]
+        budget = None if milliseconds is None else milliseconds * PUBLISHED_UPDATES[task] / 1e3
+        ratio = budget * len(reached) / sum(reached) if budget and any(reached) else None
+        rows.append(
+            [
+                task,
+                str(samples),
+                Number(level, 0, fixed=True),
+                f"{len(reached)} of {len(group)}",
+                Stat(tuple(reached), 0),
+                Stat(tuple(whole), 0),
+                Number(budget, 0, fixed=True),
+                Number(ratio, 1, fixed=True),
+            ]
+        )
+    header = ["task", "real samples", "return", "reached by", "s to it", "s in all"]
+    header += ["published updates, s", "times our s to it"]
+    text = (
+        "The return is the published one, our target where there is none. It is reached when the "
+        "actor earns it in the real world at an evaluation during training, of 10 episodes and for "
+        "the log alone, or at the end, planner or actor, of the final ones. *In all* is phases 1 "
+        "and 2. *Published updates* is the paper's number of TD3 updates times the median of "
+        "ours at its batch of 64, from `make bench`: without imagining, and without a model."
+    )
+    table = Table("time_to_return", header, rows)
+    return Section("From nothing to the published return", text, {"Seconds on one core": table})
+
+
+def seconds_to(run: Run, level: float) -> float | None:
+    """Seconds of a run until it earned ``level``; ``None`` if it never did."""
+    for point in run.curve:
+        if point.phase != "evaluate" and point.return_mean >= level:
+            return point.seconds
+    if any(acting.mean >= level for acting in run.acting.values()):
+        return run.seconds["model"] + run.seconds["policy"]
+    return None
+
+
+def _update_milliseconds(benchmarks: Path) -> float | None:
+    """The benchmark's median, if it was run."""
+    title, contender = _BENCHMARK
+    if not benchmarks.is_file():
+        return None
+    rows = json.loads(benchmarks.read_text()).get(title, {}).get("rows", [])
+    return next((float(row[1]) for row in rows if row[0] == contender), None)

@@ -1,0 +1,91 @@
+"""The script that runs a grid, its methods and its launchers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from grid_cells import METHODS, PAPER, TINY, YAML
+from hydra import compose, initialize_config_dir
+
+from recipe_configs import compose_request
+
+
+@pytest.mark.slow
+def test_the_script_runs_a_grid_shows_it_and_skips_it(
+    run_script: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quoted = ",".join(f'"{override}"' for override in TINY)
+    arguments = ("task=pendulum,cartpole", "share=0.03,0.04", "refresh=0", f"overrides=[{quoted}]")
+    run_script("run_grid", *arguments)
+    shown = capsys.readouterr().out
+    assert "4 cells: 4 done" in shown
+    assert "phihp   cartpole  200      default  done" in shown
+    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "results").rglob("*.json")}
+    assert len(kept) == 4 * 4
+    run_script("run_grid", *arguments)
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "results").rglob("*.json")} == kept
+    # One more cell, which fails, and the exit code says so.
+    with pytest.raises(SystemExit) as error:
+        run_script("run_grid", "task=cartpole", "refresh=0.1", 'overrides=["policy.gama=1"]')
+    assert error.value.code == 1
+    shown = capsys.readouterr().out
+    assert "cartpole-default-n2500-seed0 failed: " in shown
+    assert "retry_failed=true" in shown
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["method=phihp,td5"], "method: expected one of"),
+        (["seed=0,-1"], "seed: expected 0 to"),
+        (["share=0"], "share: expected a positive number or null"),
+        (["task=my-task"], "share: expected null for 'my-task'"),
+        (["label=a/b"], "label: expected letters"),
+        (["jobs=0"], "jobs: expected a positive number"),
+        (["+sead=0"], "sead: unknown key; did you mean 'seed'"),
+    ],
+)
+def test_a_wrong_grid_is_one_sentence_and_no_run(
+    run_script: Callable[..., None], tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit, match=f"^error: {message}"):
+        run_script("run_grid", *arguments)
+    assert not (tmp_path / "outputs").exists()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("task", ["pendulum", "acrobot-swingup"])
+def test_every_method_composes(method: str, task: str) -> None:
+    how = METHODS[method]
+    lines = [f"task={task}", "seed=1", "progress=false", *how.overrides, *YAML["overrides"]]
+    if how.samples_key is not None:
+        lines.append(f"{how.samples_key}=500")
+    made = compose_request(how.recipe, lines).config
+    assert getattr(made, "method", "phihp") == method
+    assert made.seed == 1
+
+
+@pytest.mark.parametrize("launcher", ["basic", "joblib", "ray", "submitit"])
+def test_every_launcher_composes(launcher: str) -> None:
+    plugin = f"hydra_plugins.hydra_{launcher}_launcher"
+    if launcher != "basic" and (find_spec("hydra_plugins") is None or find_spec(plugin) is None):
+        pytest.skip(f"hydra-{launcher}-launcher is not installed")
+    with initialize_config_dir(str(PAPER / "config"), version_base="1.3"):
+        made = compose("grid", [f"launcher={launcher}"], return_hydra_config=True)
+    assert launcher in made.hydra.launcher._target_.lower() or launcher == "submitit"
+    assert made.hydra.mode.name == "MULTIRUN"
+
+
+@pytest.mark.slow
+def test_processes_of_one_machine(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    quoted = ",".join(f'"{override}"' for override in TINY)
+    command = [sys.executable, str(PAPER / "run_grid.py"), "launcher=joblib", "jobs=2"]
+    command += ["task=pendulum", "seed=0,1", "share=0.03", f"overrides=[{quoted}]"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
+    assert "2 cells: 2 done" in done.stdout, done.stderr

@@ -1,0 +1,67 @@
+"""Which cells a grid has, how they stand and how that is shown."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from grid_cells import YAML
+
+from grid import Cell, GridConfig, LiveTable, Status, look, swept_cells
+from grid.display import summary, table
+from phihp_torchrl.trainers import ConfigError
+
+
+def test_the_grid_is_the_product_in_the_launchers_order(tmp_path: Path) -> None:
+    base = {key: value for key, value in YAML.items() if key not in ("defaults", "hydra")}
+    overrides = ["task=pendulum,acrobot", "seed=range(2)", "share=1,null", "launcher=joblib"]
+    with pytest.raises(ConfigError, match="launcher: unknown key"):
+        swept_cells({**base, "launcher": "joblib"}, overrides, tmp_path)
+    names = [files.cell.name for files in swept_cells(base, overrides, tmp_path)]
+    assert names == [
+        "pendulum-default-n2000-seed0",
+        "pendulum-default-seed0",
+        "pendulum-default-n2000-seed1",
+        "pendulum-default-seed1",
+        "acrobot-default-n5000-seed0",
+        "acrobot-default-seed0",
+        "acrobot-default-n5000-seed1",
+        "acrobot-default-seed1",
+    ]
+
+
+def test_the_table_has_a_row_for_each_setting(config: GridConfig) -> None:
+    states = {}
+    for seed in (0, 1):
+        files = replace(config, seed=seed).files(Path())
+        states[files] = look(files)
+    assert table(states)[1:] == ["phihp   pendulum  60       default  waiting  waiting"]
+    assert summary([*states.values()]) == "2 cells: 2 waiting"
+
+
+def test_workers_get_a_table_that_shows_nothing() -> None:
+    live = LiveTable()
+    live._lines = 7
+    assert pickle.loads(pickle.dumps(live))._lines == 0
+
+
+def test_half_written_files_say_what_they_are(config: GridConfig) -> None:
+    files = config.files(Path())
+    files.run.mkdir(parents=True)
+    files.failure.write_text("{")
+    assert "cannot be read" in look(files).detail
+    files.failure.unlink()
+    (files.run / "config.yaml").write_text("task: pendulum\n")
+    (files.run / "metrics.csv").write_text("phase,unit,real_steps,seconds\nmodel,0,30")
+    assert (look(files).status, look(files).detail) == (Status.STOPPED, "")
+    files.kept.mkdir(parents=True)
+    files.evaluation.write_text("{}")
+    assert (look(files).status, look(files).detail) == (Status.DONE, "unreadable")
+
+
+def test_names_are_files() -> None:
+    assert Cell("ph-cem", "acrobot", 3, 5000, "paper").name == "acrobot-ph-cem-paper-n5000-seed3"
+    with pytest.raises(ValueError, match="label: expected letters"):
+        Cell("phihp", "acrobot", 0, label="..")

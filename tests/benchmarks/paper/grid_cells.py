@@ -1,0 +1,43 @@
+"""Cells of a grid for tests: the methods, the least they can do, and what they left."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import yaml
+
+from cluster_check import TINY as LEAST
+from grid import CellState, GridConfig, MethodConfig, work
+from phihp_torchrl.trainers import from_mapping
+from recipe_configs import RECIPES
+
+PAPER = RECIPES.parent / "benchmarks" / "paper"
+YAML = yaml.safe_load((PAPER / "config" / "grid.yaml").read_text())
+METHODS = {
+    name: from_mapping(MethodConfig, how, f"methods.{name}")
+    for name, how in YAML["methods"].items()
+}
+# The number of samples is the cell's.
+TINY = (
+    *LEAST,
+    "progress=false",
+    "model.steps_per_iteration=30",
+    "policy.updates=8",
+    "evaluate.video=false",
+)
+
+
+def do(config: GridConfig) -> CellState:
+    return work(config, Path())
+
+
+def words(config: GridConfig) -> list[str]:
+    """What the log says happened to a cell, word by word."""
+    lines = config.files(Path()).log.read_text().splitlines()
+    return [line.rsplit(" ", 1)[1] for line in lines if " INFO grid." in line]
+
+
+def returns(config: GridConfig) -> dict[str, list[float]]:
+    results = json.loads(config.files(Path()).evaluation.read_text())
+    return {name: result["returns"] for name, result in results.items()}

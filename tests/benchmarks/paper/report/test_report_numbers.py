@@ -1,0 +1,225 @@
+"""The numbers of a report, by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from kept_runs import make, make_run, results, table
+
+from measures import DEFAULT_SAMPLES
+from phihp_torchrl import get_task
+from recipe_configs import CONFIG
+from report import (
+    BOUNDS,
+    NOT_RUN,
+    normalise,
+    read_run,
+    samples_to_90,
+    welch,
+)
+from report.aggregate import aggregates, profiles, score_matrix
+from report.curves import mean_over_tasks, sample_curves, update_curves
+from report.efficiency import learning_points, sample_efficiency
+from report.learning_curve import learning_curve
+from report.paper_systems import (
+    CEM_ORACLE,
+    PHIHP,
+    TD3,
+    TD3_IM_PH,
+)
+from report.significance import welch_published
+from report.time_to_return import seconds_to
+
+
+def test_bounds_are_what_the_rewards_give_at_rest() -> None:
+    for name, steps in (("pendulum", 200), ("pendulum-swingup", 500), ("acrobot-swingup", 500)):
+        task = get_task(name)
+        assert task.max_steps == steps
+        worst = torch.zeros(task.system.state_dim)
+        best = worst.clone()
+        (worst if "pendulum" in name else best)[0] = math.pi
+        action = torch.zeros(task.system.action_dim)
+        for state, bound in zip((worst, best), BOUNDS[name], strict=True):
+            reward = task.reward(state, action, state)
+            assert steps * float(reward) == pytest.approx(bound, rel=1e-5, abs=1e-4)
+    assert normalise("cartpole", 250.0) == 0.5
+    with pytest.raises(ValueError, match="task: expected one of"):
+        normalise("my-task", 0.0)
+
+
+def test_samples_to_90_percent() -> None:
+    assert samples_to_90([(100, 449.0), (200, 450.0), (300, 500.0)]) == 200
+    assert samples_to_90([(100, -111.0), (200, -110.0), (300, -100.0)]) == 200
+    assert samples_to_90([(100, -5.0)]) == 100
+
+
+def test_a_policy_from_a_model_has_a_point_for_each_number_of_samples(tmp_path: Path) -> None:
+    # The actor's evaluations during training all come after the last real step.
+    curve = ((200, -900.0), (200, -300.0))
+    make_run(tmp_path, samples=200, curve=curve)
+    make_run(tmp_path, samples=1000, acting={"planner": [-120.0], "actor": [-150.0]})
+    found = results(tmp_path)
+    few, many = found.scores(PHIHP, "pendulum")
+    assert learning_points(few) == [(200, -185.0)]
+    assert learning_points(many) == [(1000, -120.0)]
+    assert sample_efficiency(found, PHIHP, "pendulum") == (1000.0,)
+    assert sample_curves(found, (PHIHP, TD3), "pendulum") == {
+        "PhIHP": [((200, 1000), (-185.0, -120.0))]
+    }
+    # The planner's score counts for PhIHP, the actor's for TD3-im-ph: one run gives both.
+    assert [score.mean for score in found.usual(TD3_IM_PH, "pendulum")] == [-150.0]
+    assert update_curves(found, "pendulum") == {}
+    assert len(update_curves(results(tmp_path), "cartpole")) == 0
+
+
+def test_a_policy_from_real_steps_has_a_curve(tmp_path: Path) -> None:
+    curve = ((1000, -900.0), (20000, -205.0), (30000, -199.0))
+    make_run(tmp_path, "td3", samples=30000, curve=curve, acting={"actor": [-200.0]}, kind=None)
+    found = results(tmp_path)
+    (score,) = found.scores(TD3, "pendulum")
+    assert score.run.kind is None
+    # The last point is the final evaluation.
+    assert learning_points(score) == [(1000, -900.0), (20000, -205.0), (30000, -200.0)]
+    assert sample_efficiency(found, TD3, "pendulum") == (20000.0,)
+    assert update_curves(found, "pendulum") == {
+        "TD3": [([0.0, 10.0, 20.0], [-900.0, -205.0, -199.0])]
+    }
+
+
+def test_an_own_run_goes_before_the_part_of_another(tmp_path: Path) -> None:
+    make_run(tmp_path, "phihp")
+    make_run(tmp_path, "td3-im-ph", acting={"actor": [-1.0]})
+    assert [score.mean for score in results(tmp_path).scores(TD3_IM_PH, "pendulum")] == [-1.0]
+
+
+def test_a_cem_without_samples(tmp_path: Path) -> None:
+    make_run(tmp_path, "cem-oracle", samples=0, kind="oracle", acting={"planner": [-200.0]})
+    assert sample_efficiency(results(tmp_path), CEM_ORACLE, "pendulum") == (0.0,)
+
+
+def test_the_mean_over_tasks_starts_where_all_have_a_return() -> None:
+    steps, values = mean_over_tasks(
+        {
+            "cartpole": {0: [(0, 100.0), (50, 500.0)], 1: [(10, 300.0)]},
+            "acrobot": {0: [(20, -500.0), (60, 0.0)]},
+        }
+    )
+    assert steps.tolist() == [20, 50, 60]
+    assert values.tolist() == pytest.approx([0.2, 0.4, 0.9])
+
+
+def test_welch_against_numbers_worked_by_hand() -> None:
+    pytest.importorskip("scipy")
+    # Means 2 and 5, variances 1 and 4: t = -3 / sqrt(1/3 + 4/3).
+    test = welch([1.0, 2.0, 3.0], [3.0, 5.0, 7.0])
+    assert test is not None
+    assert test.t == pytest.approx(-3 / math.sqrt(5 / 3))
+    assert 0.05 < test.p < 0.15
+    assert str(test) == "no difference"
+    assert welch([1.0], [2.0, 3.0]) is None
+    assert str(welch([500.0, 500.0], [400.0, 400.0])) == "higher"
+    assert str(welch([500.0, 500.0], [500.0, 500.0])) == "no difference"
+    published = welch_published("acrobot-swingup", "TD3")
+    assert published is not None
+    assert published.t == pytest.approx((371 - 119) / math.sqrt((52**2 + 71**2) / 10))
+    assert welch_published("cartpole-swingup", "TD3") is None
+
+
+def test_aggregates_and_profiles_against_numpy() -> None:
+    pytest.importorskip("rliable")
+    matrix = np.array([[0.1, 0.5], [0.2, 0.6], [0.3, 0.7], [0.4, 0.8]])
+    one = aggregates({"x": matrix}, reps=200)["x"]
+    assert one.values[0] == pytest.approx(np.median(matrix.mean(0)))
+    assert one.values[2] == pytest.approx(matrix.mean())
+    assert one.values[3] == pytest.approx(1 - matrix.mean())
+    assert one.values[1] == pytest.approx(np.sort(matrix.ravel())[2:-2].mean())
+    assert (one.low <= one.values).all()
+    assert (one.values <= one.high).all()
+    assert (one.low < one.high).all()
+    # The same draws each time, and NumPy's own go on as if there had been none.
+    np.random.seed(3)
+    before = np.random.get_state()[1].tolist()
+    again = aggregates({"y": matrix, "x": matrix}, reps=200)["x"]
+    assert again.low.tolist() == one.low.tolist()
+    assert np.random.get_state()[1].tolist() == before
+    middle, low, high = profiles({"x": matrix}, np.array([0.0, 0.45, 0.9]), reps=50)["x"]
+    assert middle.tolist() == [1.0, 0.5, 0.0]
+    assert (low <= middle).all()
+    assert (middle <= high).all()
+
+
+def test_a_matrix_has_as_many_seeds_as_all_tasks_have(tmp_path: Path) -> None:
+    for seed in range(3):
+        make_run(tmp_path, task="cartpole", seed=seed, acting={"planner": [500.0], "actor": [0.0]})
+    make_run(tmp_path, task="acrobot", acting={"planner": [-250.0], "actor": [0.0]})
+    matrix = score_matrix(results(tmp_path), PHIHP, ("cartpole", "acrobot"))
+    assert matrix is not None
+    assert matrix.tolist() == [[1.0, 0.5]]
+    assert score_matrix(results(tmp_path), PHIHP, ("cartpole", "pendulum")) is None
+
+
+def test_the_default_presets_samples_go_before_more(tmp_path: Path) -> None:
+    for samples, earned in ((200, -300.0), (1000, -200.0), (2000, -100.0)):
+        make_run(tmp_path, samples=samples, acting={"actor": [earned], "planner": [earned]})
+    make_run(tmp_path, method="td3", samples=30_000, kind=None, acting={"actor": [-150.0]})
+    found = results(tmp_path)
+    assert [score.mean for score in found.usual(PHIHP, "pendulum")] == [-200.0]
+    assert [score.mean for score in found.usual(TD3, "pendulum")] == [-150.0]
+
+
+def test_the_default_preset_takes_the_samples_that_reports_think() -> None:
+    for task, samples in DEFAULT_SAMPLES.items():
+        path = CONFIG / "task" / f"{task}.yaml"
+        preset = yaml.safe_load(path.read_text())["presets"]["default"]
+        assert preset["model"]["real_steps"] == samples, task
+
+
+def test_seconds_to_a_return(tmp_path: Path) -> None:
+    """During training by the clock of the curve, at the end by all of it, else never."""
+    curve = ((1000, -900.0), (1000, -300.0), (1000, -150.0))
+    run = read_run(make_run(tmp_path, curve=curve))
+    assert seconds_to(run, -300.0) == 1.0
+    assert seconds_to(run, -200.0) == 2.0
+    last = read_run(make_run(tmp_path, seed=1, curve=curve[:1]))
+    assert seconds_to(last, -200.0) == 30.0
+    assert seconds_to(last, -100.0) is None
+
+
+def test_time_to_the_published_return_against_published_updates(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    make_run(runs, curve=((1000, -900.0), (1000, -200.0)))
+    make_run(runs, seed=1, curve=((1000, -900.0),))
+    make_run(runs, task="cartpole", acting={"planner": [9.0, 9.0], "actor": [8.0, 8.0]})
+    rows = [["fused step, compiled", "2.0", "1.00"]]
+    timed = tmp_path / "benchmarks.json"
+    timed.write_text(json.dumps({"A TD3 update of 64 transitions": {"rows": rows}}))
+    make(tmp_path, runs, benchmarks=str(timed))
+    pendulum, cartpole = table(tmp_path, "time_to_return")
+    assert float(pendulum["s to it mean"]) == pytest.approx((1.0 + 30.0) / 2)
+    assert float(pendulum["published updates, s"]) == pytest.approx(1000.0)
+    assert float(pendulum["times our s to it"]) == pytest.approx(1000.0 / 15.5)
+    assert cartpole["reached by"] == "0 of 1"
+    assert cartpole["times our s to it"] == NOT_RUN
+    make(tmp_path, runs, benchmarks=str(tmp_path / "none.json"))
+    assert table(tmp_path, "time_to_return")[0]["published updates, s"] == NOT_RUN
+
+
+def test_learning_curve(tmp_path: Path) -> None:
+    one = ([0, 100, 200], [0.0, 1.0, 2.0])
+    two = ([0, 100, 300], [2.0, 3.0, 5.0])
+    figure = learning_curve({"PhIHP": [one, two]}, reference={"paper": 1.5}, title="pendulum")
+    axis = figure.axes[0]
+    mean = axis.lines[2]
+    assert mean.get_xdata().tolist() == [0, 100, 200]
+    assert mean.get_ydata().tolist() == [1.0, 2.0, 3.0]
+    assert axis.get_xscale() == "linear"
+    wide = learning_curve({"a": [([10, 1000], [0, 1])], "b": [([], [])]})
+    assert wide.axes[0].get_xscale() == "symlog"
+    for i, drawn in enumerate((figure, wide, learning_curve({}))):
+        drawn.savefig(tmp_path / f"{i}.png")

@@ -1,0 +1,113 @@
+"""Reports on disk: pages, tables and figures."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from pathlib import Path
+
+import pytest
+from kept_runs import make, make_run, table, text
+
+from report import (
+    NOT_RUN,
+    Number,
+    Stat,
+    Table,
+    Trial,
+    read_runs,
+    write_trials,
+)
+from report.overview import END, START, fill_page, overview
+
+
+def test_the_whole_report(tmp_path: Path) -> None:
+    pytest.importorskip("rliable")
+    runs = tmp_path / "runs"
+    for seed in (0, 1):
+        for task in ("pendulum", "pendulum-swingup", "cartpole", "cartpole-swingup", "acrobot",
+                     "acrobot-swingup"):  # fmt: skip
+            make_run(runs, task=task, seed=seed, error=0.01, curve=((1000, -200.0 - seed),))
+            make_run(runs, "dd-cem", task, seed, acting={"planner": [-400.0 - seed]},
+                     kind="data_driven", error=0.1)  # fmt: skip
+    make_run(runs, label="paper", seed=3)
+    trials = [Trial("pendulum", 0, "planning_horizon", h, -180.0 - h, 1.0, 5, h) for h in (1, 4)]
+    write_trials(tmp_path / "sensitivity" / "pendulum.json", trials)
+    (tmp_path / "sensitivity" / "torn.json").write_text("[{")
+    (tmp_path / "page.md").write_text(f"# Page\n\n{START}\nold\n{END}\n\nThe end.\n")
+    made = make(tmp_path)
+    (problem,) = made.problems
+    assert "torn.json" in problem
+
+    page = (tmp_path / "report" / "README.md").read_text()
+    for section in made.sections:
+        assert f"## {section.title}\n" in page
+        for made_table in section.tables.values():
+            assert table(tmp_path, made_table.name)
+        for picture in section.pictures:
+            for suffix in ("svg", "png"):
+                assert (tmp_path / "report/figures" / f"{picture.name}.{suffix}").stat().st_size
+            assert f"(figures/{picture.name}.svg)" in page
+    # Beside the published numbers, and of the one label alone.
+    assert "| −185.0 ± 0.0 (2) | −263 ± 144 | not run | −276 ± 301 |" in page
+    rows = {row["task, model"]: row for row in table(tmp_path, "generalization")}
+    assert float(rows["pendulum, data-driven"]["error mean"]) == 0.1
+    assert float(rows["pendulum, hybrid"]["return mean"]) == -185.0
+    sweep = [(row["setting"], row["value"]) for row in table(tmp_path, "sensitivity")]
+    assert sweep == [("H", "1"), ("H", "4")]
+    over = {row["system"]: row for row in table(tmp_path, "aggregates_over_tasks")}
+    assert over["TD-MPC"]["mean"] == NOT_RUN
+    assert 0 < float(over["dd-CEM"]["IQM"]) < float(over["PhIHP"]["IQM"]) < 1
+    assert "## paper" in (tmp_path / "overview.md").read_text()
+    filled = (tmp_path / "page.md").read_text()
+    assert "old" not in filled
+    assert "| pendulum | 2 | 1000 | −185.0 ± 0.0 | −186.5 ± 0.0 |" in filled
+    assert filled.endswith("\n\nThe end.\n")
+
+    # The same runs make the same files.
+    def files() -> dict[str, bytes]:
+        kept = sorted(p for p in (tmp_path / "report").rglob("*") if p.is_file())
+        return {str(path): path.read_bytes() for path in kept}
+
+    before = files()
+    shutil.rmtree(tmp_path / "report")
+    make(tmp_path)
+    assert files() == before
+
+
+def test_without_the_extra_the_rest_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_run(tmp_path / "runs")
+    monkeypatch.setitem(__import__("sys").modules, "rliable", None)
+    made = make(tmp_path)
+    assert "phihp_torchrl[report]" in text(made, "Performance over runs")
+    assert any("rliable" in problem for problem in made.problems)
+    assert table(tmp_path, "main_return")[0]["PhIHP mean"] == "-185.0"
+
+
+def test_a_table_for_people_and_for_programs() -> None:
+    rows = [["a", Stat((1.0, 3.0)), Number(2.0)], ["b", Stat(()), Number(None)], ["c", "–", "–"]]
+    made = Table("t", ["x", "y", "z"], rows)
+    assert made.markdown().splitlines()[2:] == [
+        "| a | 2.0 ± 1.4 (2) | 2 |",
+        "| b | not run | not run |",
+        "| c | – | – |",
+    ]
+    assert made.csv().splitlines() == [
+        "x,y mean,y std,y seeds,z",
+        f"a,2.0,{math.sqrt(2)},2,2.0",
+        "b,not run,not run,not run,not run",
+        "c,–,–,–,–",
+    ]
+
+
+def test_a_page_without_markers_is_left_alone(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    make_run(tmp_path / "runs")
+    runs = read_runs(tmp_path / "runs").runs
+    assert not fill_page(page, runs)
+    page.write_text(f"{END} {START}")
+    assert not fill_page(page, runs)
+    assert page.read_text() == f"{END} {START}"
+    assert "### Time" in overview(runs)
