@@ -71,7 +71,7 @@ def prepare(
     observation = TensorDict(observation=task.system.observe(task.reset.sample([])))
     return (
         section,
-        lambda: trainer.update(trainer.replay.sample(), trainer.generator),
+        lambda: trainer.update(trainer.replay.sample(), generator=trainer.generator),
         lambda: agent(observation.clone()),
     )
 
