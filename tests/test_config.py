@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
+from bare_keys import bare_keys
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
@@ -78,14 +79,7 @@ def keys(mapping: Mapping[str, Any]) -> set[str]:
 
 @pytest.mark.parametrize("path", sorted(CONFIG.rglob("*.yaml")), ids=lambda p: p.stem)
 def test_every_key_has_a_comment_above_it(path: Path) -> None:
-    lines = path.read_text().splitlines()
-    bare = []
-    for above, line in zip(["", *lines], lines, strict=False):
-        key = re.match(r"\s*(- )?(override )?[\w/]+:", line)
-        parent = re.match(r"\s*[\w/]+:$", line)  # a heading: its keys have the comments
-        if key and not parent and not above.strip().startswith("#"):
-            bare.append(line)
-    assert not bare
+    assert not bare_keys(path)
 
 
 def test_the_papers_tables() -> None:
