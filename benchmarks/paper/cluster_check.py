@@ -20,8 +20,10 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+from measures import read_curve, write_curve
 from report import ReportConfig, make_report
 
 TASKS, SEEDS, SHARE = ("pendulum", "cartpole"), range(6), 0.05
@@ -183,6 +185,8 @@ def forget_times(folder: Path) -> None:
     metadata = json.loads((folder / "metadata.json").read_text())
     metadata["seconds"] = dict.fromkeys(metadata["seconds"], 0.0)
     (folder / "metadata.json").write_text(json.dumps(metadata))
+    curve = [replace(point, seconds=0.0) for point in read_curve(folder / "curve.csv")]
+    write_curve(folder / "curve.csv", curve)
 
 
 def check(place: Path, timeout: float = 900.0) -> list[str]:

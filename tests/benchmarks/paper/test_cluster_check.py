@@ -9,6 +9,7 @@ import pytest
 from kept_runs import make_run
 
 import cluster_check
+from measures import CurvePoint, write_curve
 
 
 @pytest.mark.slow
@@ -42,7 +43,9 @@ def test_times_apart_two_reports_are_the_same(tmp_path: Path) -> None:
     pytest.importorskip("rliable")
     for name, ms, earned in (("a", 1.0, -5.0), ("b", 2.0, -5.0), ("c", 1.0, -6.0)):
         acting = {"planner": [earned, -7.0], "actor": [-8.0, -9.0]}
-        make_run(tmp_path / name / "results", ms=ms, acting=acting)
+        folder = make_run(tmp_path / name / "results", ms=ms, acting=acting)
+        # A return that the report gives the seconds to.
+        write_curve(folder / "curve.csv", [CurvePoint("policy", 1000, ms, "actor", -150.0)])
     first, second, third = (
         cluster_check.report_files(tmp_path / name, tmp_path / "compared") for name in "abc"
     )
