@@ -14,7 +14,7 @@ DOCS_STAMP := $(VENV)/.installed-docs
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 HEADLESS := SDL_VIDEODRIVER=dummy MPLBACKEND=Agg WANDB_MODE=disabled
 
-.PHONY: help demo test lint format types docs bench clean
+.PHONY: help demo test lint format types config docs bench clean
 
 help: ## print these targets
 	@grep -hE '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -39,6 +39,9 @@ format: $(STAMP) ## let ruff fix and format the code
 
 types: $(STAMP) ## mypy alone
 	$(BIN)/mypy
+
+config: $(STAMP) ## write the YAML that mirrors the dataclasses of settings
+	$(BIN)/python -m phihp_torchrl.commands.mirror
 
 docs: $(DOCS_STAMP) ## build the documentation into site/
 	$(BIN)/python -m mkdocs build --strict

@@ -1,21 +1,114 @@
-"""PhIHP in TorchRL: a physics-informed model, a policy learned in imagination, hybrid planning."""
+"""PhIHP in TorchRL: a physics-informed model, a policy learned in imagination, hybrid planning.
+
+Importing this package registers the gymnasium ids of the paper's tasks and costs next to nothing:
+each name below is imported with its folder when it is first used, and torch with it.
+"""
 
 from __future__ import annotations
 
-from phihp_torchrl.deployment import load_agent
-from phihp_torchrl.dynamics import DynamicsLoss, HybridDynamics
-from phihp_torchrl.envs import WorldModelEnv  # (importing envs registers the gymnasium ids)
-from phihp_torchrl.planners import CEMPlanner
-from phihp_torchrl.tasks import Task, get_task, register_task
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+
+if TYPE_CHECKING:
+    from phihp_torchrl.commands import Learned, learn
+    from phihp_torchrl.config import ConfigError, load_config, register_method
+    from phihp_torchrl.deployment import Agent, load_agent, save_agent
+    from phihp_torchrl.dynamics import DynamicsLoss, HybridDynamics, TaskWorldModel
+    from phihp_torchrl.evaluation import evaluate
+    from phihp_torchrl.imagination import WorldModelEnv
+    from phihp_torchrl.planners import CEMPlanner, MPPIPlanner, register_planner
+    from phihp_torchrl.systems import Constant, System
+    from phihp_torchrl.tasks import Box, Task, get_task, register_task
+    from phihp_torchrl.trainers import RunConfig, RunResult, register_phase, run
+    from phihp_torchrl.worlds import Plant, World, make_world, register_plant, register_world
+
+__version__ = "0.2.0"
+
+_HOMES = {
+    "commands": ("Learned", "learn"),
+    "config": ("ConfigError", "load_config", "register_method"),
+    "deployment": ("Agent", "load_agent", "save_agent"),
+    "dynamics": ("DynamicsLoss", "HybridDynamics", "TaskWorldModel"),
+    "evaluation": ("evaluate",),
+    "imagination": ("WorldModelEnv",),
+    "planners": ("CEMPlanner", "MPPIPlanner", "register_planner"),
+    "systems": ("Constant", "System"),
+    "tasks": ("Box", "Task", "get_task", "register_task"),
+    "trainers": ("RunConfig", "RunResult", "register_phase", "run"),
+    "worlds": ("Plant", "World", "make_world", "register_plant", "register_world"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Agent",
+    "Box",
     "CEMPlanner",
+    "ConfigError",
+    "Constant",
     "DynamicsLoss",
     "HybridDynamics",
+    "Learned",
+    "MPPIPlanner",
+    "Plant",
+    "RunConfig",
+    "RunResult",
+    "System",
     "Task",
+    "TaskWorldModel",
+    "World",
     "WorldModelEnv",
+    "evaluate",
     "get_task",
+    "learn",
     "load_agent",
+    "load_config",
+    "make_world",
+    "register_method",
+    "register_phase",
+    "register_planner",
+    "register_plant",
     "register_task",
+    "register_world",
+    "run",
+    "save_agent",
 ]
-__version__ = "0.1.0"
+
+_ENV_IDS = {
+    "phihp/Pendulum-v0": ("pendulum", 200),
+    "phihp/PendulumSwingup-v0": ("pendulum-swingup", 500),
+    "phihp/CartPole-v0": ("cartpole", 500),
+    "phihp/CartPoleSwingup-v0": ("cartpole-swingup", 500),
+    "phihp/CartPoleSwingupPublished-v0": ("cartpole-swingup-published", 500),
+    "phihp/Acrobot-v0": ("acrobot", 500),
+    "phihp/AcrobotSwingup-v0": ("acrobot-swingup", 500),
+}
+# These repeat names and step limits of the tasks, because importing the tasks imports torch. A test
+# checks that the two agree.
+
+for _id, (_task, _steps) in _ENV_IDS.items():
+    if _id not in gymnasium.registry:
+        gymnasium.register(
+            _id,
+            entry_point="phihp_torchrl.worlds:make_task_env",
+            max_episode_steps=_steps,
+            kwargs={"task": _task},
+        )
+if "phihp/Task-v0" not in gymnasium.registry:
+    gymnasium.register("phihp/Task-v0", entry_point="phihp_torchrl.worlds:make_limited_env")
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = _HOME_OF[name]
+    if home == "trainers":
+        import_module(f"{__name__}.tdmpc")  # it registers the phase of TD-MPC
+    value = getattr(import_module(f"{__name__}.{home}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -18,10 +18,13 @@ _PACKAGES = ("phihp_torchrl", "torch", "torchrl", "tensordict", "gymnasium", "nu
 
 
 def describe_origin(seed: int) -> dict[str, Any]:
-    """Seed, time, command, commit, machine and versions, ready for JSON.
+    """Describe where a result comes from: seed, time, command, commit, machine and versions.
 
     Args:
-        seed: what everything random was drawn from.
+        seed: the seed of the run.
+
+    Returns:
+        Values that can be written as JSON.
 
     Examples:
         >>> origin = describe_origin(seed=3)
@@ -29,11 +32,7 @@ def describe_origin(seed: int) -> dict[str, Any]:
         (3, ['cpus', 'gpus', 'memory_gib', 'system'])
     """
     versions = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "not installed"
+    versions |= {package: package_version(package) for package in _PACKAGES}
     status = _git("status", "--porcelain", "--untracked-files=no")
     return {
         "seed": seed,
@@ -51,8 +50,21 @@ def describe_origin(seed: int) -> dict[str, Any]:
     }
 
 
+def package_version(package: str = "phihp_torchrl") -> str:
+    """Return the version of an installed package, or ``"not installed"``.
+
+    Examples:
+        >>> package_version("no-such-package")
+        'not installed'
+    """
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
 def origin_text(origin: Mapping[str, Any]) -> str:
-    """Commit and machine, as they stand below a published table.
+    """Return commit and machine as one line, for the foot of a published table.
 
     Examples:
         >>> origin_text({"commit": "5e6e490c0ffee", "dirty": False,
@@ -63,7 +75,7 @@ def origin_text(origin: Mapping[str, Any]) -> str:
 
 
 def commit_text(origin: Mapping[str, Any]) -> str:
-    """The commit in short, with a ``+`` where the source tree had changes.
+    """Return the short commit, with a ``+`` if the source tree had uncommitted changes.
 
     Examples:
         >>> commit_text({"commit": "5e6e490c0ffee", "dirty": True})
@@ -73,14 +85,14 @@ def commit_text(origin: Mapping[str, Any]) -> str:
 
 
 def machine_text(origin: Mapping[str, Any]) -> str:
-    """The size of the machine, in words.
+    """Return the size of the machine as text.
 
     Examples:
         >>> machine_text({"machine": {"cpus": 2, "memory_gib": 23.5, "gpus": 0}})
         '2 cores, 24 GiB, 0 GPUs'
     """
     machine = origin["machine"]
-    memory = machine["memory_gib"]  # not every system tells
+    memory = machine["memory_gib"]  # None on systems that do not report it
     size = "memory unknown" if memory is None else f"{memory:.0f} GiB"
     return f"{machine['cpus']} cores, {size}, {machine['gpus']} GPUs"
 
@@ -88,12 +100,12 @@ def machine_text(origin: Mapping[str, Any]) -> str:
 def _memory_gib() -> float | None:
     try:
         return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
-    except (AttributeError, ValueError, OSError):  # not every system tells
+    except (AttributeError, ValueError, OSError):  # not every system reports its memory
         return None
 
 
 def _git(*arguments: str) -> str | None:
-    """What git says about the source tree; ``None`` where there is no git or no repository."""
+    """Run git in the source tree; ``None`` if there is no git or no repository."""
     try:
         done = subprocess.run(
             ["git", *arguments],

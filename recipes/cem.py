@@ -1,22 +1,13 @@
-"""Plain CEM in the world itself (CEM-oracle), in a hybrid model (Ph-CEM) or without prior (dd-CEM).
+"""Plain CEM in the world itself (cem-oracle), in a hybrid model (ph-cem) or without prior (dd-cem).
 
-python recipes/cem.py task=pendulum-swingup method=ph-cem
+    python recipes/cem.py task=pendulum-swingup method=ph-cem
 
-``config/cem.yaml`` has more examples; ``--help`` and ``--cfg job`` print every key.
+The same as ``phihp train method=cem-oracle``; ``--help`` prints the settings that matter most.
 """
 
 from __future__ import annotations
 
-import hydra
-from omegaconf import DictConfig
-from phihp import launch
-
-
-@hydra.main(version_base="1.3", config_path="config", config_name="cem")
-def main(composed: DictConfig) -> None:
-    """Run the phases, and print what the agent earned."""
-    launch(composed)
-
+from phihp_torchrl.commands import main
 
 if __name__ == "__main__":
-    main()
+    main(command="train", method="cem-oracle")

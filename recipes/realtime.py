@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDict
 
 from phihp_torchrl.deployment import AgentError, load_agent, run_realtime
-from phihp_torchrl.evaluation import markdown_table
+from phihp_torchrl.evaluation import EVALUATION_SEED, markdown_table
 
 
 def main() -> None:
@@ -36,10 +36,12 @@ def main() -> None:
     except AgentError as error:
         sys.exit(f"error: {error}")
     for _ in range(10):  # compiles
-        agent(TensorDict(observation=agent.task.system.observe(agent.task.reset.sample([]))))
+        agent(TensorDict(observation=agent.task.observe(agent.task.reset.sample([]))))
     rows = []
     for rate in arguments.rates:
-        report = run_realtime(agent, agent.task, rate=rate, seconds=arguments.seconds)
+        report = run_realtime(
+            agent, agent.task, rate=rate, seconds=arguments.seconds, seed=EVALUATION_SEED
+        )
         rows.append([f"{value:.4g}" for value in report.summary().values()])
     header = ["Hz", "actions", "p50 ms", "p99 ms", "p99.9 ms", "missed", "mean reward"]
     print(markdown_table(header, rows))

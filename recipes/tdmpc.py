@@ -1,22 +1,13 @@
-"""TD-MPC (Hansen et al., 2022): latent model, policy and Q from real steps, planning by MPPI.
+"""TD-MPC, the model-based baseline that learns everything from real steps.
 
-python recipes/tdmpc.py task=pendulum-swingup preset=default
+    python recipes/tdmpc.py task=pendulum-swingup
 
-``config/tdmpc.yaml`` has more examples; ``--help`` and ``--cfg job`` print every key.
+The same as ``phihp train method=td-mpc``; ``--help`` prints the settings that matter most.
 """
 
 from __future__ import annotations
 
-import hydra
-from omegaconf import DictConfig
-from phihp import launch
-
-
-@hydra.main(version_base="1.3", config_path="config", config_name="tdmpc")
-def main(composed: DictConfig) -> None:
-    """Run the phases, and print what the agent earned."""
-    launch(composed)
-
+from phihp_torchrl.commands import main
 
 if __name__ == "__main__":
-    main()
+    main(command="train", method="td-mpc")

@@ -1,0 +1,56 @@
+"""The console command ``phihp``: which command is meant, and its words."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
+
+COMMANDS = {
+    "train": "learn a model, a policy and a planner: phihp train task=acrobot",
+    "evaluate": "play a trained agent: phihp evaluate agent=results/agents/acrobot",
+    "export": "write an agent's plan as one file: phihp export agent=DIR formats=[onnx]",
+    "list": "print tasks, methods, presets, worlds and planners, a line each",
+}
+"""Commands and what each does, in a line. Each is a module here, with a function ``main``."""
+
+
+def main(words: Sequence[str] | None = None, *, command: str | None = None, **options: Any) -> None:
+    """Run the console command ``phihp``.
+
+    Args:
+        words: words of the command line. Defaults to those of the process.
+        command: name of the command. Defaults to the first word.
+        options: options of the function ``main`` of the command's module.
+
+    Raises:
+        SystemExit: for an unknown command, and for errors of the command.
+
+    Examples:
+        >>> main(["--help"])  # doctest: +ELLIPSIS
+        usage: phihp COMMAND [setting=value ...] [--help]
+        ...
+    """
+    words = list(sys.argv[1:] if words is None else words)
+    if command is None:
+        if not words or words[0] in ("-h", "--help"):
+            print(usage())  # noqa: T201 (a console command)
+            return
+        command, *words = words
+    if command not in COMMANDS:
+        known = list(COMMANDS)
+        sys.exit(f"error: command: expected one of {known}, got {command!r}.\n\n{usage()}")
+    import_module(f"phihp_torchrl.commands.{command}").main(words, **options)
+
+
+def usage() -> str:
+    """Return the text of ``phihp --help``.
+
+    Examples:
+        >>> usage().splitlines()[0]
+        'usage: phihp COMMAND [setting=value ...] [--help]'
+    """
+    lines = ["usage: phihp COMMAND [setting=value ...] [--help]", ""]
+    lines += [f"  {name:<10} {about}" for name, about in COMMANDS.items()]
+    return "\n".join(lines)

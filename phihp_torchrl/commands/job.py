@@ -1,0 +1,71 @@
+"""The part of ``phihp train`` that needs torch: import, compose, run and print the result."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from torchrl.checkpoint import CheckpointError
+
+import phihp_torchrl.tdmpc  # noqa: F401  (it registers its phase)
+from phihp_torchrl.config import (
+    MODULE,
+    ConfigError,
+    compose_yaml,
+    open_mappings,
+    override_lines,
+    publish_offers,
+)
+from phihp_torchrl.evaluation import returns_table
+from phihp_torchrl.trainers import (
+    RunResult,
+    read_request,
+    read_result,
+    run,
+)
+
+
+def launch(words: Sequence[str], settings: Sequence[str], config_dir: str | None) -> None:
+    """Let Hydra compose the settings and run one job or, with ``--multirun``, many.
+
+    Args:
+        words: the whole command line.
+        settings: the assignments in it.
+        config_dir: the directory of ``--config-dir``.
+
+    Raises:
+        ConfigError: for settings that cannot be composed.
+    """
+    if "-m" not in words and "--multirun" not in words:
+        compose_yaml(settings, config_dir)  # whose errors name the key
+    publish_offers(*([] if config_dir is None else [config_dir]))
+    sys.argv = [sys.argv[0], *open_mappings(words)]
+    hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="train")(job)()
+
+
+def job(composed: DictConfig) -> None:
+    """Run what Hydra composed, and print the returns of the agent."""
+    try:
+        request = read_request(composed, HydraConfig.get().overrides.task)
+        result = run(request.config, request.path, resume=request.resume)
+    except (ConfigError, CheckpointError) as error:
+        sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit(130)
+    tell(result)
+
+
+def tell(result: RunResult) -> None:
+    """Print the table of returns, or how to resume a run that was stopped."""
+    if result.signal is not None and not result.finished:
+        words = ["phihp", "train", *override_lines({"resume": str(result.path)})]
+        print(f"\nStopped. Go on with: {shlex.join(words)}")  # noqa: T201 (a console command)
+        sys.exit(128 + result.signal)
+    earned = read_result(result.path)
+    if earned is not None:
+        print(f"\n{returns_table([earned])}")  # noqa: T201
+    print(f"Everything is in {result.path}")  # noqa: T201

@@ -1,0 +1,44 @@
+"""Settings: how they are read and checked, the methods that use them, and their YAML files.
+
+Nothing in this folder imports torch, so that settings can be read and printed without delay.
+"""
+
+from __future__ import annotations
+
+from phihp_torchrl.config.checks import (
+    check_choice,
+    check_count,
+    check_not_negative,
+    check_positive,
+    check_positive_share,
+    check_share,
+    check_widths,
+    is_whole,
+)
+from phihp_torchrl.config.choices import YAML, offer, publish_offers
+from phihp_torchrl.config.compose import (
+    MODULE,
+    PLACES,
+    apply_overrides,
+    compose_yaml,
+    finish,
+    load_config,
+    open_mappings,
+    override_key,
+    override_lines,
+    parse_overrides,
+)
+from phihp_torchrl.config.errors import ConfigError
+from phihp_torchrl.config.help import help_text, sentences, settings_text
+from phihp_torchrl.config.methods import METHODS, Method, get_method, register_method
+from phihp_torchrl.config.registry import Registry
+from phihp_torchrl.config.typed import (
+    differences,
+    flatten,
+    from_mapping,
+    kind_mapping,
+    read_kind,
+    to_mapping,
+)
+
+__all__ = ["ConfigError", "Method", "get_method", "load_config", "register_method"]

@@ -1,0 +1,53 @@
+"""Choices of a settings group that are registered from Python, besides those with a YAML file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+
+YAML = Path(__file__).parent / "settings"
+"""Directory of the YAML files, both in a checkout and in an installed wheel."""
+
+_OFFERED: dict[tuple[str, str], dict[str, Any]] = {}
+
+
+def offer(group: str, name: str, content: Mapping[str, Any]) -> None:
+    """Make ``group=name`` a choice that sets ``content``; a YAML file of that name overrides it.
+
+    Args:
+        group: name of the group, e.g. ``"task"``.
+        name: name of the choice.
+        content: the settings of this choice, as a nested mapping from the top level.
+
+    Examples:
+        >>> offer("task", "my-task", {"task": "my-task"})
+    """
+    _OFFERED[group, name] = dict(content)
+
+
+def publish_offers(*config_dirs: str | Path) -> None:
+    """Register with Hydra every offered choice without a YAML file here or in ``config_dirs``."""
+    store = ConfigStore.instance()
+    for (group, name), content in _OFFERED.items():
+        file = Path(group, f"{name}.yaml")
+        if not any((Path(place) / file).is_file() for place in (YAML, *config_dirs)):
+            store.store(name, content, group=group, package="_global_")
+
+
+def choices_of(group: str, config_dir: str | Path | None = None) -> list[str]:
+    """List the names that a group may be set to, sorted.
+
+    Args:
+        group: the group, e.g. ``"task"``.
+        config_dir: a directory of further YAML files.
+
+    Examples:
+        >>> choices_of("budget")
+        ['fast', 'full']
+    """
+    places = [YAML, *([] if config_dir is None else [Path(config_dir)])]
+    files = {path.stem for place in places for path in (place / group).glob("*.yaml")}
+    return sorted(files | {name for of, name in _OFFERED if of == group})

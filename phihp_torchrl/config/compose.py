@@ -1,0 +1,238 @@
+"""Compose the settings of a run from names and overrides; the only reader of the YAML files.
+
+Settings come in layers, each of which overrides the one before: the defaults of the dataclasses,
+the preset, the task's changes to that preset, the changes of method and budget, the command line.
+Hydra composes the files. Nothing here imports torch, so that ``--help`` answers without delay.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from phihp_torchrl.config.choices import choices_of, publish_offers
+from phihp_torchrl.config.errors import ConfigError
+from phihp_torchrl.config.typed import flatten
+
+MODULE = "phihp_torchrl.config.settings"
+"""Package of the YAML files, as Hydra addresses it."""
+
+PLACES = ("run_dir", "resume")
+"""Settings that say where a run is stored; they are not part of its configuration."""
+
+# The values of these are names of files, whose content is in the composed settings already.
+_GROUPS = ("preset", "task", "method", "budget", "logger", "world", "planner")
+_NAMES = ("task", "preset", "method")
+_FIRST_PLANNER = "cem"  # the kind of planner that a layer's numbers are for if it names none
+
+
+def load_config(
+    task: str | None = None,
+    *,
+    method: str | None = None,
+    preset: str | None = None,
+    overrides: Sequence[str] | Mapping[str, Any] = (),
+    config_dir: str | Path | None = None,
+) -> dict[str, Any]:
+    """Compose the settings of a run, as ``phihp train`` composes them from the same words.
+
+    Args:
+        task: name of a task; by default ``pendulum-swingup``.
+        method: name of a method; by default ``phihp``.
+        preset: ``"default"`` or ``"paper"``.
+        overrides: further settings, as on a command line (``["policy.updates=3000"]``) or as a
+            mapping from dotted keys to values.
+        config_dir: directory of additional YAML files, as for ``--config-dir``.
+
+    Returns:
+        Nested dictionaries of plain values. Their ranges are checked when a run reads them.
+
+    Raises:
+        ConfigError: for an unknown name or key, and for an override that cannot be parsed.
+
+    Examples:
+        >>> settings = load_config("acrobot", preset="paper", overrides=["policy.batch_size=32"])
+        >>> settings["planner"]["alpha"], settings["policy"]["batch_size"]
+        (0.8, 32)
+    """
+    named = {"task": task, "method": method, "preset": preset}
+    lines = [f"{key}={name}" for key, name in named.items() if name is not None]
+    lines += override_lines(overrides)
+    return finish(compose_yaml(lines, config_dir), lines)
+
+
+def compose_yaml(overrides: Sequence[str], config_dir: str | Path | None = None) -> Any:
+    """Compose the YAML files and ``overrides`` with Hydra; :func:`finish` applies the last layers.
+
+    Raises:
+        ConfigError: for a key, value or file that Hydra refuses; the message names it.
+    """
+    lines = open_mappings(overrides)
+    publish_offers(*([] if config_dir is None else [config_dir]))
+    if config_dir is not None:
+        lines.append(f"hydra.searchpath=[{_quoted(f'file://{Path(config_dir).absolute()}')}]")
+    try:
+        with initialize_config_module(MODULE, version_base="1.3"):
+            return compose("train", lines)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise _explain(overrides, config_dir, error) from error
+
+
+def _explain(
+    overrides: Sequence[str], config_dir: str | Path | None, error: Exception
+) -> ConfigError:
+    """Turn Hydra's error into one that names the key and what is expected there."""
+    lines = {override_key(line): line for line in parse_overrides(overrides)}
+    for group in _GROUPS:
+        if group in lines and not lines[group].is_sweep_override():
+            chosen, known = str(lines[group].value()), choices_of(group, config_dir)
+            if chosen not in known:
+                return ConfigError(group, f"expected one of {known}, got {chosen!r}.")
+    groups = [word for word in overrides if word.split("=", 1)[0] in _GROUPS]
+    if len(groups) < len(overrides):  # otherwise a choice is wrong and not a key
+        composed: Any = OmegaConf.to_container(compose_yaml(groups, config_dir))
+        known_keys = flatten(composed)
+        for key in lines:
+            if key not in (*_GROUPS, *known_keys) and not key.startswith(("hydra", "world.")):
+                close = get_close_matches(key, known_keys, n=1)
+                hint = f"did you mean {close[0]!r}?" if close else "phihp train --cfg job has all."
+                return ConfigError(key, f"unknown key; {hint}")
+    return ConfigError("settings", " ".join(str(error).split()))
+
+
+def finish(composed: Any, overrides: Sequence[str]) -> dict[str, Any]:
+    """Apply the layers of task, method and budget to the preset, and then the command line.
+
+    A task's file has a section for each preset (``presets``); methods and budgets have a section
+    of their changes (``changes``). Both are applied here, after Hydra, because a setting decides
+    which preset's section applies.
+
+    Args:
+        composed: the settings that Hydra composed.
+        overrides: the overrides of the command line.
+
+    Raises:
+        ConfigError: for a key in one of these sections that the settings do not have.
+    """
+    config: Any = OmegaConf.create(OmegaConf.to_container(composed, resolve=True))
+    presets, changes = config.pop("presets", None) or {}, config.pop("changes", None) or {}
+    preset = presets.get(config.get("preset")) or {}
+    for name, section in ((f"presets.{config.get('preset')}", preset), ("changes", changes)):
+        section = _for_planner(section, config)
+        _check_section(section, config, name)
+        config = OmegaConf.merge(config, section)
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    return apply_overrides(plain, overrides)
+
+
+def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """Return ``config`` with the overrides of a command line applied; new keys are added.
+
+    Raises:
+        ConfigError: for text that cannot be parsed as an override.
+
+    Examples:
+        >>> apply_overrides({"policy": {"updates": 8000}}, ["policy.updates=10"])
+        {'policy': {'updates': 10}}
+    """
+    changed = OmegaConf.create(dict(config))
+    for line in parse_overrides(overrides):
+        key = override_key(line)
+        if key in _NAMES:
+            changed[key] = str(line.value())
+        elif key not in _GROUPS and not key.startswith("hydra"):
+            OmegaConf.update(changed, key, line.value(), force_add=True)
+    plain: Any = OmegaConf.to_container(changed, resolve=True)
+    return plain
+
+
+def parse_overrides(overrides: Sequence[str]) -> list[Override]:
+    """Parse the words of a command line as Hydra's overrides, leaving out deletions (``~key``).
+
+    Raises:
+        ConfigError: for a word that cannot be parsed.
+    """
+    try:
+        lines = OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException as error:
+        raise ConfigError("settings", " ".join(str(error).split())) from error
+    return [line for line in lines if not line.is_delete()]
+
+
+def open_mappings(words: Sequence[str]) -> list[str]:
+    """Prefix overrides that assign a mapping with ``++``, so that they may add keys to it.
+
+    Examples:
+        >>> open_mappings(["world.friction={joint:0.1}", "seed=0"])
+        ['++world.friction={joint:0.1}', 'seed=0']
+    """
+    return [f"++{word}" if re.match(r"[\w.]+=\s*\{", word) else word for word in words]
+
+
+def override_key(line: Override) -> str:
+    """Return the dotted key that an override sets."""
+    return str(line.key_or_group)
+
+
+def override_lines(overrides: Sequence[str] | Mapping[str, Any]) -> list[str]:
+    """Write overrides as words of a command line.
+
+    Examples:
+        >>> override_lines({"policy.updates": 10, "model.hidden_sizes": [8, 8], "run_dir": None})
+        ['policy.updates=10', 'model.hidden_sizes=[8,8]', 'run_dir=null']
+    """
+    if isinstance(overrides, str):
+        raise ConfigError("overrides", f"expected a list of texts or a mapping, got {overrides!r}.")
+    if isinstance(overrides, Mapping):
+        return [f"{key}={_quoted(value)}" for key, value in overrides.items()]
+    return [str(line) for line in overrides]
+
+
+def _quoted(value: Any) -> str:
+    """Write a value in Hydra's grammar."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (list, tuple)):
+        return f"[{','.join(_quoted(item) for item in value)}]"
+    if isinstance(value, Mapping):
+        return "{" + ",".join(f"{key}:{_quoted(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, str):
+        # Without quotes if Hydra's grammar reads it as text too, and not as a number or boolean.
+        plain = re.fullmatch(r"[A-Za-z_/][\w./:-]*", value, re.ASCII)
+        if plain and value.lower() not in ("null", "true", "false", "inf", "nan"):
+            return value
+        # In Hydra's grammar a backslash stands for itself, unless a quote follows it.
+        escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + m[2].replace("'", "\\'"), value)
+        return f"'{escaped}'"
+    return repr(value)
+
+
+def _for_planner(section: Mapping[str, Any], config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Drop a layer's planner settings if they are for another kind of planner."""
+    numbers = section.get("planner")
+    chosen = (config.get("planner") or {}).get("kind", _FIRST_PLANNER)
+    if numbers is None or numbers.get("kind", _FIRST_PLANNER) == chosen:
+        return section
+    return {key: value for key, value in section.items() if key != "planner"}
+
+
+def _check_section(section: Mapping[str, Any], config: Mapping[str, Any], path: str) -> None:
+    """Refuse keys in a task's or a method's section that the settings do not have."""
+    for key, value in section.items():
+        name = f"{path}.{key}"
+        if key not in config:
+            raise ConfigError(name, f"unknown key; expected one of {sorted(config)}.")
+        if isinstance(value, Mapping) and isinstance(config[key], Mapping):
+            _check_section(value, config[key], name)
