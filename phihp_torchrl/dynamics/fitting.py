@@ -1,4 +1,4 @@
-"""Fitting the model to transitions: by Adam, as published, or by Levenberg-Marquardt."""
+"""Fitting a model to transitions: by Adam, as published, or by Levenberg-Marquardt."""
 
 from __future__ import annotations
 
@@ -11,32 +11,42 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.func import functional_call, jacrev, vmap
 
+from phihp_torchrl.config import ConfigError, check_choice, check_count, check_positive
 from phihp_torchrl.dynamics.loss import DynamicsLoss
-from phihp_torchrl.ranges import check_positive
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How to fit the model.
+    """How a model is fitted to transitions.
 
     Args:
-        method: ``"levenberg_marquardt"`` or ``"adam"``. The model is small and its loss a sum of
-            squares, so a second-order method reaches errors in seconds that Adam does not reach at
-            all.
-        steps: steps of the method.
+        method: ``"levenberg_marquardt"`` or ``"adam"``. The model is small and its loss is a sum of
+            squares, so a second-order method reaches within seconds errors that Adam never reaches.
+        steps: number of optimization steps.
         scaled: whether errors are measured in units of one-step changes
             (:meth:`DynamicsLoss.set_scales`), or in raw units as published.
         batch_size: transitions per step; ``None`` for all of them, as published.
-        learning_rate: of Adam.
-        cosine_decay: whether Adam's learning rate decays to zero.
-        initial_lambda: where Levenberg-Marquardt's lambda starts. A small one makes the prior
-            explain what it can before the residual may take part.
-        final_lambda: where it ends.
-        patience: Levenberg-Marquardt stops after this many steps, at its final lambda, that did not
-            improve the held-out error by a tenth.
-        shuffle_actions: whether Levenberg-Marquardt's penalty takes each state with the action of
-            another transition. A controller's actions go with the velocities, so the smallest F^r
-            on the pairs as they came would explain friction by a wrong effect of the action.
+        learning_rate: learning rate of Adam.
+        cosine_decay: whether the learning rate of Adam decays to zero.
+        initial_lambda: first value of λ for Levenberg-Marquardt. A small one lets the prior explain
+            as much as it can before the residual contributes.
+        final_lambda: last value of λ for Levenberg-Marquardt.
+        patience: Levenberg-Marquardt stops after this many steps at its final λ in which the
+            held-out error did not fall by a tenth.
+        shuffle_actions: whether the penalty of Levenberg-Marquardt pairs each state with the action
+            of another transition. A controller's actions are correlated with the velocities, so
+            that the smallest F^r on the pairs as recorded would explain friction by a wrong effect
+            of the action.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> FitConfig(method="newton")
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: method: expected one of ['levenberg_marquardt', 'adam'], \
+got 'newton'.
     """
 
     method: str = "levenberg_marquardt"
@@ -48,21 +58,26 @@ class FitConfig:
     initial_lambda: float = 1e-2
     final_lambda: float = 1e7
     patience: int = 8
-    shuffle_actions: bool = False
+    shuffle_actions: bool = True
 
     def __post_init__(self) -> None:
-        if self.method not in ("levenberg_marquardt", "adam"):
-            raise ValueError(
-                f"method: expected 'levenberg_marquardt' or 'adam', got {self.method!r}."
-            )
-        check_positive(self, "steps", "patience", "learning_rate", "initial_lambda", "final_lambda")
-        if self.batch_size is not None and self.batch_size < 1:
-            raise ValueError(f"batch_size: expected a positive number, got {self.batch_size}.")
+        check_choice(self, "method", ("levenberg_marquardt", "adam"))
+        check_count(self, "steps", "patience")
+        check_positive(self, "learning_rate", "initial_lambda", "final_lambda")
+        if self.batch_size is not None:
+            check_count(self, "batch_size")
 
 
 @dataclass(frozen=True)
 class FitReport:
-    """How a fit went. Errors are mean ‖(s' - ŝ') / scale‖² over transitions."""
+    """The result of a fit. Errors are the mean of ‖(s' - ŝ') / scale‖² over transitions.
+
+    Args:
+        train_error: error on the transitions that were fitted.
+        held_out_error: error on the held-out transitions.
+        steps: optimization steps that were taken.
+        seconds: duration of the fit.
+    """
 
     train_error: float
     held_out_error: float
@@ -77,30 +92,50 @@ def fit(
     config: FitConfig,
     generator: torch.Generator | None = None,
 ) -> FitReport:
-    """Fit ``loss.dynamics`` to transitions, in place, from where it is.
+    """Fit ``loss.dynamics`` to transitions in place, starting from its current parameters.
 
     Args:
-        loss: the model's loss; its lambda and scales are changed too.
+        loss: the loss of the model; its λ and scales are changed as well.
         train: transitions ``[N]`` to learn from.
-        held_out: transitions ``[M]`` that only measure; the best parameters on them are kept by
-            Levenberg-Marquardt.
-        config: how.
-        generator: source of mini-batches.
+        held_out: transitions ``[M]`` on which the error is measured; Levenberg-Marquardt keeps the
+            parameters with the smallest error on them.
+        config: method and hyper-parameters of the fit.
+        generator: source of mini-batches. Defaults to torch's global generator.
+
+    Returns:
+        Errors, number of steps and duration.
 
     Raises:
-        ValueError: if there are no transitions, or some are not finite; and for Levenberg-Marquardt
-            with an integrator that chooses its own steps, which it cannot differentiate row by row.
+        ValueError: if there are no transitions, or some are not finite.
+        ConfigError: for Levenberg-Marquardt with an integrator that chooses its own steps, which
+            cannot be differentiated row by row.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> task = get_task("pendulum")
+        >>> truth = HybridDynamics.pure_prior(task, constants={"mass": 1.5})
+        >>> state, action = task.coverage.sample([64]), 4 * torch.rand(64, 1) - 2
+        >>> following = TensorDict(observation=task.observe(truth(state, action)), batch_size=[64])
+        >>> data = TensorDict(
+        ...     observation=task.observe(state), action=action, next=following, batch_size=[64]
+        ... ).detach()
+        >>> loss = DynamicsLoss(HybridDynamics.pure_prior(task))
+        >>> report = fit(loss, data, data, FitConfig(steps=20))
+        >>> report.held_out_error < 1e-6
+        True
     """
     for name, data in (("train", train), ("held_out", held_out)):
         if data.batch_size.numel() == 0:  # numel of a tensordict is never below 1
             raise ValueError(f"{name}: expected at least one transition, got none.")
-        # As given, for an angle is found even of infinite cosines and sines.
+        # Check the observations, because atan2 makes a finite angle of infinite cosines and sines.
         if not all(data.get(key).isfinite().all() for key in loss.in_keys):
             raise ValueError(f"{name}: expected finite transitions, got some that are not.")
     if config.method == "levenberg_marquardt" and not loss.dynamics.integrator.compiles:
-        raise ValueError(
-            "method: expected 'adam' for a model that is integrated by "
-            f"{type(loss.dynamics.integrator).__name__}, got {config.method!r}."
+        raise ConfigError(
+            "method",
+            "expected 'adam' for a model that is integrated by "
+            f"{type(loss.dynamics.integrator).__name__}, got {config.method!r}.",
         )
     start = time.perf_counter()
     if config.scaled:
@@ -155,8 +190,8 @@ def _levenberg_marquardt(
 
     .. math:: (J^\top J + \mu\,\mathrm{diag}\,J^\top J)\,\delta = -J^\top r
 
-    The penalty is squared here, where the paper's is a norm, because the method needs squares; and
-    F^r is penalised at shuffled actions (``config.shuffle_actions``).
+    The penalty is a square, unlike the norm in the paper's equation 3, because the method needs
+    squares; and F^r is penalised at shuffled actions if ``config.shuffle_actions`` is set.
     """
     system = _LeastSquares(loss)
     transitions = loss.transitions(train)
@@ -169,7 +204,7 @@ def _levenberg_marquardt(
     damping = 1e-2
     growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
     loss.lambda_.fill_(config.initial_lambda)
-    # The start competes too: a fit goes on from a model that may be hard to beat.
+    # The first parameters are a candidate too, because they may come from an earlier, better fit.
     best, best_error = theta, system.prediction_error(theta, reference)
     if not math.isfinite(best_error):
         best_error = math.inf
@@ -194,7 +229,7 @@ def _levenberg_marquardt(
 
 
 class _LeastSquares:
-    """The loss as rows to be squared, and its Jacobian, over one flat vector of parameters."""
+    """The residuals of the least-squares problem, and their Jacobian, by one parameter vector."""
 
     def __init__(self, loss: DynamicsLoss) -> None:
         self.loss = loss
@@ -232,7 +267,7 @@ class _LeastSquares:
     def step(
         self, theta: Tensor, rows: tuple[Tensor, ...], damping: float
     ) -> tuple[Tensor, float, bool]:
-        """One step downhill: new parameters, new damping, and whether any was found."""
+        """Take one damped step: new parameters, new damping, and whether the cost has fallen."""
         values = self._rows(theta, *rows).reshape(-1)
         jacobian = self._jacobian(theta, *rows).reshape(values.shape[0], -1)
         normal = (jacobian.mT @ jacobian).double()

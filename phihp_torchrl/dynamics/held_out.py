@@ -1,4 +1,4 @@
-"""What is held out of the real data, and how far the model strays on it."""
+"""Held-out real data, and the error of the model's rollouts on them."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from torch import Tensor
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 
 BLOCK = 20
-"""Held-out data are whole blocks of this many steps, one in ten."""
+"""Steps in a block; one block in ten is held out."""
 
 
 def split(data: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase, TensorDictBase | None]:
-    """Hold out every tenth block of consecutive steps.
+    """Hold out every tenth block of :data:`BLOCK` consecutive steps.
 
     Args:
-        data: transitions ``[N]`` in the order they happened.
+        data: transitions ``[N]`` in chronological order.
 
     Returns:
-        Transitions to learn from, held-out transitions, and those held-out blocks in which no
+        The transitions to learn from, the held-out transitions, and the held-out blocks in which no
         episode ended, ``[blocks, steps]``, or ``None`` if there are none.
     """
     index = torch.arange(len(data))
     held = (index // BLOCK) % 10 == 9
-    if not held.any():  # too few for a block
+    if not held.any():  # too few transitions for a held-out block
         held = index % 10 == 9 if len(data) >= 10 else index == len(data) - 1
         return data[~held] if len(data) > 1 else data, data[held], None
     blocks = data[: len(data) // BLOCK * BLOCK].reshape(-1, BLOCK)[9::10]
@@ -38,4 +38,4 @@ def rollout_error(loss: DynamicsLoss, blocks: TensorDictBase) -> Tensor:
     """Mean distance ‖s - ŝ‖ after the last step of each block ``[blocks, steps]``, raw units."""
     state, action, next_state = loss.transitions(blocks)
     predicted = loss.dynamics.rollout(state[:, 0], action)[:, -1]
-    return loss.dynamics.task.system.difference(next_state[:, -1], predicted).norm(dim=-1).mean()
+    return loss.dynamics.task.difference(next_state[:, -1], predicted).norm(dim=-1).mean()

@@ -1,16 +1,26 @@
-"""The transition that PhIHP learns: F^p + F^r, integrated over one control step."""
+"""The transition that PhIHP learns: F^p + F^r, integrated over one control step (equation 2)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from phihp_torchrl.dynamics.prior import PhysicsPrior, WorldPhysics
+from phihp_torchrl.config import ConfigError, Registry
+from phihp_torchrl.dynamics.prior import PhysicsPrior
 from phihp_torchrl.dynamics.residual import ResidualMLP
 from phihp_torchrl.integrators import Integrator, make_integrator
 from phihp_torchrl.tasks import Task
+
+RESIDUAL_OUTPUTS = ("velocities", "all")
+"""The components of ds/dt that a residual may correct: those of velocities, or all."""
+
+PRIORS: Registry[Any] = Registry("prior")
+"""Modules that can be F^p, by the ``kind`` in their ``config``."""
+
+PRIORS.register(PhysicsPrior.kind, PhysicsPrior)
 
 
 class HybridDynamics(nn.Module):
@@ -20,18 +30,20 @@ class HybridDynamics(nn.Module):
         \frac{ds}{dt} = F^p(s, a; \theta_p) + F^r(s, a; \theta_r), \qquad
         s_{t+1} = \mathrm{ODESolve}(s_t, a_t, t, t + \Delta t)
 
-    Either part may be absent: without prior it is the data-driven model, without residual the pure
-    prior. :meth:`hybrid`, :meth:`data_driven`, :meth:`pure_prior` and :meth:`oracle` build the four
-    models of the paper.
+    Either part may be absent: without the prior this is the data-driven model, without the residual
+    the pure prior. :meth:`hybrid`, :meth:`data_driven` and :meth:`pure_prior` build the models of
+    the paper. Its oracle is the simulated world itself
+    (:meth:`~phihp_torchrl.worlds.SimulatedWorld.oracle`).
 
     Args:
-        task: gives the system, the time step and the limits on actions and velocities.
+        task: the task, which has the system, the time step and the limits of actions and
+            velocities.
         prior: F^p, a module ``(state, action) -> ds/dt``, or ``None``.
-        residual: F^r, likewise, or ``None``.
-        integrator: solver name or instance.
+        residual: F^r, a module ``(state, action) -> ds/dt``, or ``None``.
+        integrator: name of an integrator, or an instance.
 
     Raises:
-        ValueError: if both parts are absent, or the integrator is unknown.
+        ConfigError: if both parts are absent, or the integrator is unknown.
 
     Examples:
         >>> from phihp_torchrl import HybridDynamics, get_task
@@ -50,7 +62,7 @@ class HybridDynamics(nn.Module):
     ) -> None:
         super().__init__()
         if prior is None and residual is None:
-            raise ValueError("prior, residual: expected at least one of them, got neither.")
+            raise ConfigError("prior, residual", "expected at least one of them, got neither.")
         self.task = task
         self.prior = prior
         self.residual = residual
@@ -63,24 +75,29 @@ class HybridDynamics(nn.Module):
         *,
         constants: Mapping[str, float] | None = None,
         hidden_sizes: Sequence[int] = (16, 16),
-        activation: type[nn.Module] = nn.ReLU,
+        activation: type[nn.Module] = nn.Tanh,
         residual_outputs: str = "velocities",
         integrator: str | Integrator = "semi_implicit_euler",
     ) -> HybridDynamics:
-        """The model of the paper: learnable prior and residual.
+        """Build the model of the paper: a prior with learned constants, and a residual network.
 
         Args:
             task: the task.
-            constants: first guess of the prior's constants.
+            constants: first guesses of the prior's constants, by name.
             hidden_sizes: widths of the residual's hidden layers.
-            activation: class of its activation.
-            residual_outputs: ``"velocities"`` corrects accelerations alone (positions follow their
-                velocities by definition), ``"all"`` every component of ds/dt, as published.
-            integrator: solver name or instance.
+            activation: class of the residual's activation.
+            residual_outputs: ``"velocities"`` corrects the accelerations only (the derivative of a
+                position is its velocity by definition), ``"all"`` every component of ds/dt, as
+                published.
+            integrator: name of an integrator, or an instance.
+
+        Raises:
+            ConfigError: for an unknown ``residual_outputs``, integrator or constant.
         """
-        if residual_outputs not in ("velocities", "all"):
-            raise ValueError(
-                f"residual_outputs: expected 'velocities' or 'all', got {residual_outputs!r}."
+        if residual_outputs not in RESIDUAL_OUTPUTS:
+            raise ConfigError(
+                "residual_outputs",
+                f"expected one of {list(RESIDUAL_OUTPUTS)}, got {residual_outputs!r}.",
             )
         system = task.system
         outputs = system.velocity_indices or None if residual_outputs == "velocities" else None
@@ -97,10 +114,10 @@ class HybridDynamics(nn.Module):
         task: Task,
         *,
         hidden_sizes: Sequence[int] = (16, 16),
-        activation: type[nn.Module] = nn.ReLU,
+        activation: type[nn.Module] = nn.Tanh,
         integrator: str | Integrator = "semi_implicit_euler",
     ) -> HybridDynamics:
-        """The same transition without F^p."""
+        """Build the transition without F^p, the paper's data-driven model."""
         residual = ResidualMLP(task.system, hidden_sizes, activation=activation)
         return cls(task, prior=None, residual=residual, integrator=integrator)
 
@@ -112,19 +129,48 @@ class HybridDynamics(nn.Module):
         constants: Mapping[str, float] | None = None,
         integrator: str | Integrator = "semi_implicit_euler",
     ) -> HybridDynamics:
-        """The same transition without F^r."""
+        """Build the transition without F^r, from the prior alone."""
         prior = PhysicsPrior(task.system, constants)
         return cls(task, prior=prior, residual=None, integrator=integrator)
 
+    @property
+    def config(self) -> dict[str, Any]:
+        """Plain values from which :meth:`from_config` builds it again, without the weights.
+
+        Raises:
+            ConfigError: for a part without an attribute ``config`` of that sort.
+        """
+        parts = {"prior": self.prior, "residual": self.residual}
+        return {
+            **{
+                name: None if part is None else _config_of(name, part)
+                for name, part in parts.items()
+            },
+            "integrator": {"name": self.integrator.name, **self.integrator.settings},
+        }
+
     @classmethod
-    def oracle(cls, task: Task, *, integrator: str | Integrator | None = None) -> HybridDynamics:
-        """The world itself, friction and (by default) its integrator included; nothing to learn."""
-        prior = WorldPhysics(task.system)
-        return cls(task, prior=prior, residual=None, integrator=integrator or task.integrator)
+    def from_config(cls, task: Task, config: Mapping[str, Any]) -> HybridDynamics:
+        """Build untrained dynamics from :attr:`config`.
+
+        Raises:
+            ConfigError: for an unknown kind of prior, activation or integrator.
+        """
+        prior, residual = config["prior"], config["residual"]
+        if prior is not None:
+            prior = PRIORS.find(prior["kind"]).from_config(task.system, prior)
+        if residual is not None:
+            residual = ResidualMLP.from_config(task.system, residual)
+        integrator = dict(config["integrator"])
+        solver = make_integrator(integrator.pop("name"), **integrator)
+        return cls(task, prior=prior, residual=residual, integrator=solver)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; actions are clipped."""
-        action = self.task.clip_action(action)
+        """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
+        return self.step(state, self.task.clip_action(action))
+
+    def step(self, state: Tensor, action: Tensor) -> Tensor:
+        """The next state for an action in bounds, as :meth:`Task.transition` needs it."""
         return self.integrator(
             lambda s: self.derivative(s, action), state, self.task.time_step, self.task.layout
         )
@@ -140,7 +186,7 @@ class HybridDynamics(nn.Module):
 
     @torch.no_grad()
     def residual_share(self, state: Tensor, action: Tensor) -> Tensor:
-        """What the residual explains of the motion: ‖F^r‖ / (‖F^p‖ + ‖F^r‖), scalar in [0, 1]."""
+        """Share of the residual in the motion, ‖F^r‖ / (‖F^p‖ + ‖F^r‖), a scalar in [0, 1]."""
         zero = torch.zeros((), dtype=state.dtype, device=state.device)
         prior = zero if self.prior is None else self.prior(state, action).norm()
         residual = zero if self.residual is None else self.residual(state, action).norm()
@@ -148,11 +194,11 @@ class HybridDynamics(nn.Module):
 
     @torch.no_grad()
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
-        """The states after each of the actions.
+        """Predict the states of a sequence of actions.
 
         Args:
-            state: where to start, ``[*batch, n]``.
-            actions: what to do, ``[*batch, time, m]``.
+            state: first state, ``[*batch, n]``.
+            actions: the actions, ``[*batch, time, m]``; they are clipped to their bounds.
 
         Returns:
             States after each action, ``[*batch, time, n]``.
@@ -162,3 +208,14 @@ class HybridDynamics(nn.Module):
             state = self(state, action)
             states.append(state)
         return torch.stack(states, -2)
+
+
+def _config_of(name: str, part: nn.Module) -> dict[str, Any]:
+    config = getattr(part, "config", None)
+    if not isinstance(config, dict):
+        raise ConfigError(
+            name,
+            "expected a part that says how it is built (`config`, `from_config`), "
+            f"got {type(part).__name__}.",
+        )
+    return config

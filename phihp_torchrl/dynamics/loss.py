@@ -1,4 +1,4 @@
-"""What the model is fitted to: L_pred + (1/lambda) |F^r| (paper, section 4.1, equation 3)."""
+"""The loss of the hybrid model: L_pred + (1/lambda) |F^r| (paper, section 4.1, equation 3)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from phihp_torchrl.config import check_not_negative, check_positive
 from phihp_torchrl.dynamics.hybrid import HybridDynamics
 from phihp_torchrl.dynamics.residual import spread
 
 
 class DynamicsLoss(LossModule):
-    r"""The loss of the hybrid model.
+    r"""The loss of the hybrid model (paper, section 4.1, equation 3).
 
     .. math::
         L_\lambda(\theta) = L_{pred} + \frac{1}{\lambda}\lVert F^r\rVert_2, \qquad
@@ -23,23 +24,24 @@ class DynamicsLoss(LossModule):
         \lambda \leftarrow \lambda + \tau_{ph} L_{pred}
 
     Angles are compared on the circle. :math:`\lVert F^r\rVert_2` is the mean over the batch of each
-    transition's norm, so that it does not grow with the batch. With :meth:`set_scales` errors and
-    residual are measured in units of the data's one-step changes, component by component, which
-    gives slow components a voice; without it they are in raw units, as published.
+    transition's norm, so that it does not grow with the batch. After :meth:`set_scales`, errors and
+    residual are measured in units of the data's one-step changes, component by component, so that
+    components that change slowly count as much as others; without it they are in raw units, as
+    published.
 
     Args:
         dynamics: the model to fit.
-        lambda_0: initial :math:`\lambda`.
-        tau_ph: growth of :math:`\lambda`.
+        lambda_0: initial value of :math:`\lambda`.
+        tau_ph: growth of :math:`\lambda` with the prediction error.
 
     Raises:
-        ValueError: if ``lambda_0`` is not positive or ``tau_ph`` is negative.
+        ConfigError: if ``lambda_0`` is not positive or ``tau_ph`` is negative.
 
     Examples:
         >>> from phihp_torchrl import get_task
         >>> task = get_task("pendulum")
         >>> loss = DynamicsLoss(HybridDynamics.hybrid(task), lambda_0=1e3, tau_ph=1e3)
-        >>> observation = task.system.observe(task.reset.sample([8]))
+        >>> observation = task.observe(task.reset.sample([8]))
         >>> data = TensorDict(
         ...     observation=observation,
         ...     action=torch.zeros(8, 1),
@@ -70,15 +72,13 @@ class DynamicsLoss(LossModule):
         self, dynamics: HybridDynamics, *, lambda_0: float = 1e3, tau_ph: float = 1e3
     ) -> None:
         super().__init__()
-        if not lambda_0 > 0:
-            raise ValueError(f"lambda_0: expected a positive number, got {lambda_0}.")
-        if not tau_ph >= 0:
-            raise ValueError(f"tau_ph: expected a number >= 0, got {tau_ph}.")
         self.dynamics = dynamics
-        self.tau_ph = tau_ph
+        self.lambda_0, self.tau_ph = lambda_0, tau_ph
+        check_positive(self, "lambda_0")
+        check_not_negative(self, "tau_ph")
         self.register_buffer("lambda_", torch.tensor(float(lambda_0)))
-        self.register_buffer("error_scale", torch.ones(dynamics.task.system.state_dim))
-        self.register_buffer("residual_scale", torch.ones(dynamics.task.system.state_dim))
+        self.register_buffer("error_scale", torch.ones(dynamics.task.state_dim))
+        self.register_buffer("residual_scale", torch.ones(dynamics.task.state_dim))
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -109,8 +109,8 @@ class DynamicsLoss(LossModule):
         )
 
     def transitions(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        """State, action and next state of a tensordict's transitions."""
-        locate, keys = self.dynamics.task.system.locate, self.tensor_keys
+        """Return state, action and next state of the transitions in a tensordict."""
+        locate, keys = self.dynamics.task.locate, self.tensor_keys
         next_observation = tensordict.get("next").get(keys.observation)
         state = locate(tensordict.get(keys.observation))
         return state, tensordict.get(keys.action), locate(next_observation)
@@ -122,9 +122,14 @@ class DynamicsLoss(LossModule):
         next_state: Tensor,
         penalised_action: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """What the two losses measure, scaled: ``s' - ŝ'`` and F^r, each ``[*batch, n]``.
+        """Return the scaled terms of the two losses: ``s' - ŝ'`` and F^r, each ``[*batch, n]``.
 
-        F^r is taken at ``state`` and ``penalised_action`` ``[*batch, m]``, by default ``action``.
+        Args:
+            state: states ``[*batch, n]``.
+            action: actions ``[*batch, m]``.
+            next_state: next states ``[*batch, n]``.
+            penalised_action: the actions at which F^r is evaluated, ``[*batch, m]``. Defaults to
+                ``action``.
         """
         error = self.prediction_error(state, action, next_state) / self.error_scale
         if self.dynamics.residual is None:
@@ -133,23 +138,26 @@ class DynamicsLoss(LossModule):
         return error, self.dynamics.residual(state, action) / self.residual_scale
 
     def prediction_error(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
-        """``s' - ŝ'`` ``[*batch, n]``, angles on the circle."""
-        return self.dynamics.task.system.difference(next_state, self.dynamics(state, action))
+        """``s' - ŝ'`` ``[*batch, n]``, with differences of angles in [-pi, pi)."""
+        return self.dynamics.task.difference(next_state, self.dynamics(state, action))
 
     @torch.no_grad()
     def update_lambda(self, loss_prediction: Tensor) -> None:
-        """λ ← λ + τ_ph L_pred, once an epoch."""
+        """Update λ ← λ + τ_ph L_pred, once an epoch."""
         self.lambda_.add_(self.tau_ph * loss_prediction)
 
     @torch.no_grad()
     def set_scales(self, tensordict: TensorDictBase) -> None:
-        """Measure errors in units of these transitions' one-step changes from now on.
+        """Measure errors, from now on, in units of the one-step changes of these transitions.
 
-        The residual network's input and output scales are set from the same transitions.
+        The input and output scales of the residual network are set from the same transitions.
+
+        Args:
+            tensordict: transitions of any batch shape.
         """
         state, action, next_state = self.transitions(tensordict.reshape(-1))
         task = self.dynamics.task
-        rate = task.system.difference(next_state, state) / task.time_step
+        rate = task.difference(next_state, state) / task.time_step
         size = spread(rate)
         self.error_scale.copy_(size * task.time_step)
         self.residual_scale.copy_(size)

@@ -1,27 +1,31 @@
-"""F^p as a module: the equations with learnable constants, and the whole truth for comparison."""
+"""F^p as a module: the equations of a system with constants that are learned."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.systems import System
 
 
 class PhysicsPrior(nn.Module):
-    """F^p(s, a; theta_p): a system's frictionless equations, constants learned from a first guess.
+    """F^p(s, a; theta_p): the known equations of a system, with constants learned from a guess.
 
-    Constants are kept as logarithms, so they stay positive and a step changes them by a ratio.
+    The parameter of a free constant is its logarithm, so that the constant stays positive and a
+    step changes it by a ratio. The parameter of a bounded constant is the logit of its position
+    between its limits. A fixed constant has no parameter. (Paper, section 4.1.)
 
     Args:
-        system: whose equations these are. Its friction is never read.
-        constants: first guess by name; absent ones start at the system's declared values.
-        learnable: whether the constants are parameters (else buffers).
+        system: the system, with its equations and the range of each constant.
+        constants: first guesses by name; the others are those of the system.
 
     Raises:
-        ValueError: for an unknown constant or one that is not positive.
+        ConfigError: for an unknown constant, or a guess out of its limits.
 
     Examples:
         >>> from phihp_torchrl.systems import Pendulum
@@ -32,69 +36,73 @@ class PhysicsPrior(nn.Module):
         torch.Size([4, 2])
     """
 
-    def __init__(
-        self,
-        system: System,
-        constants: Mapping[str, float] | None = None,
-        learnable: bool = True,
-    ) -> None:
+    kind = "learned"
+
+    def __init__(self, system: System, constants: Mapping[str, float] | None = None) -> None:
         super().__init__()
-        guess = type(system)(constants={**system.constants, **(constants or {})}).constants
         self.system = system
-        self.names = tuple(guess)
-        logarithms = torch.tensor([guess[name] for name in self.names]).log()
-        if learnable:
-            self.log_constants = nn.Parameter(logarithms)
-        else:
-            self.register_buffer("log_constants", logarithms)
+        self.ranges = system.with_constants(constants or {}).ranges
+        self.learned = tuple(name for name, c in self.ranges.items() if not c.fixed)
+        learned = [self.ranges[name] for name in self.learned]
+        raw = torch.tensor([1.0 if c.bounded else c.guess for c in learned]).log()
+        for i, c in enumerate(learned):
+            if c.bounded:
+                share = (c.guess - c.low) / (c.high - c.low)
+                raw[i] = math.log(share / (1.0 - share))
+        self.log_constants = nn.Parameter(raw)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Plain values from which :meth:`from_config` builds it again, without its parameters."""
+        fixed = {name: c.guess for name, c in self.ranges.items() if c.fixed}
+        return {"kind": self.kind, **({"fixed": fixed} if fixed else {})}
+
+    @classmethod
+    def from_config(cls, system: System, config: Mapping[str, Any]) -> PhysicsPrior:
+        """Build an untrained prior from :attr:`config`."""
+        return cls(system, config.get("fixed"))
 
     def constants(self) -> dict[str, Tensor]:
-        """The constants as they are now, by name, each a scalar."""
-        return dict(zip(self.names, self.log_constants.exp().unbind(), strict=True))
+        """Return the current values of the constants by name, each a scalar."""
+        raw = self.log_constants
+        values = dict(zip(self.learned, raw.exp().unbind(), strict=True))
+        for i, name in enumerate(self.learned):
+            c = self.ranges[name]
+            if c.bounded:
+                values[name] = c.low + (c.high - c.low) * raw[i].sigmoid()
+        for name, c in self.ranges.items():
+            if c.fixed:
+                values[name] = raw.new_tensor(c.guess)
+        return {name: values[name] for name in self.ranges}
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """ds/dt without friction: ``[*batch, n], [*batch, m] -> [*batch, n]``."""
+        """F^p: ``[*batch, n], [*batch, m] -> [*batch, n]``."""
         return self.system.prior(state, action, self.constants())
 
 
-class WorldPhysics(nn.Module):
-    """The true ds/dt, friction and all: what an oracle plans with and the simulated world runs on.
-
-    Args:
-        system: the world's system.
-    """
-
-    def __init__(self, system: System) -> None:
-        super().__init__()
-        self.system = system
-
-    def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """ds/dt: ``[*batch, n], [*batch, m] -> [*batch, n]``."""
-        return self.system.derivative(state, action)
-
-
 def perturbed_constants(
-    system: System, error: float, generator: torch.Generator | None = None
+    constants: Mapping[str, float], error: float, generator: torch.Generator | None = None
 ) -> dict[str, float]:
-    """A first guess of the constants: each ``1 ± error`` times the truth, the sign drawn at random.
+    """Make a wrong first guess of known constants: each times ``1 ± error``, with a random sign.
+
+    Runs in simulated worlds, whose true constants are known, start from such a guess.
 
     Args:
-        system: whose constants to perturb.
+        constants: true constants by name.
         error: relative error, in [0, 1).
-        generator: source of the signs.
+        generator: source of the signs. Defaults to torch's global generator.
 
     Raises:
-        ValueError: if ``error`` is outside [0, 1).
+        ConfigError: if ``error`` is outside [0, 1).
 
     Examples:
-        >>> from phihp_torchrl.systems import Pendulum
-        >>> sorted(perturbed_constants(Pendulum(), error=0.0).items())
-        [('gravity', 10.0), ('length', 1.0), ('mass', 1.0)]
+        >>> perturbed_constants({"mass": 2.0}, error=0.0)
+        {'mass': 2.0}
     """
     if not 0 <= error < 1:
-        raise ValueError(f"error: expected a relative error in [0, 1), got {error}.")
-    signs = torch.randint(0, 2, (len(system.constants),), generator=generator).tolist()
+        raise ConfigError("error", f"expected a relative error in [0, 1), got {error}.")
+    signs = torch.randint(0, 2, (len(constants),), generator=generator).tolist()
     return {
         name: value * (1 + error if sign else 1 - error)
-        for (name, value), sign in zip(system.constants.items(), signs, strict=True)
+        for (name, value), sign in zip(constants.items(), signs, strict=True)
     }

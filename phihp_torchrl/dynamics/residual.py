@@ -1,28 +1,40 @@
-"""F^r as a module: a small network for what the prior leaves out."""
+"""F^r as a module: a small network for the part of ds/dt that the prior leaves out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from phihp_torchrl.config import ConfigError, check_widths
 from phihp_torchrl.systems import System
+
+ACTIVATIONS = MappingProxyType(
+    {kind.__name__: kind for kind in (nn.ReLU, nn.Tanh, nn.SiLU, nn.ELU, nn.GELU, nn.Softplus)}
+)
+"""Activations of a residual, by the name of their class."""
 
 
 class ResidualMLP(nn.Module):
-    """F^r(s, a; theta_r): an MLP from the observed state and the action to a part of ds/dt.
+    """F^r(s, a; theta_r): an MLP from observation and action to components of ds/dt.
 
-    Angles enter as cosine and sine, so the residual is periodic as the world is. Inputs and outputs
-    are scaled by buffers that :meth:`set_scales` fits to data.
+    Angles enter as cosine and sine, so the residual is periodic in them. Inputs and outputs are
+    scaled by buffers that :meth:`set_scales` sets from data. (Paper, section 4.1.)
 
     Args:
-        system: whose state and action these are.
+        system: the system, whose states and actions the network reads.
         hidden_sizes: widths of the hidden layers (paper: 2 x 16, Acrobots 3 x 16).
-        outputs: indices of the components of ds/dt that the network may change; the others get
-            zero. ``None`` means all of them, as in the paper.
-        activation: class of the activation (paper: ReLU).
+        outputs: indices of the components of ds/dt that the network changes; the others are zero.
+            ``None`` means all of them, as in the paper.
+        activation: class of the activation (paper: ReLU; tanh extrapolates more smoothly).
+
+    Raises:
+        ConfigError: for widths that are not positive whole numbers, an output that the system does
+            not have, or an unknown activation.
 
     Examples:
         >>> from phihp_torchrl.systems import CartPole
@@ -39,13 +51,24 @@ class ResidualMLP(nn.Module):
         system: System,
         hidden_sizes: Sequence[int] = (16, 16),
         outputs: Sequence[int] | None = None,
-        activation: type[nn.Module] = nn.ReLU,
+        activation: type[nn.Module] = nn.Tanh,
     ) -> None:
         super().__init__()
-        if not hidden_sizes or any(size < 1 for size in hidden_sizes):
-            raise ValueError(f"hidden_sizes: expected positive widths, got {tuple(hidden_sizes)}.")
         self.system = system
+        self.hidden_sizes, self.activation = tuple(hidden_sizes), activation
+        check_widths(self, "hidden_sizes")
         self.outputs = tuple(range(system.state_dim) if outputs is None else outputs)
+        if not self.outputs or sorted(set(self.outputs) & set(range(system.state_dim))) != [
+            *self.outputs
+        ]:
+            raise ConfigError(
+                "outputs", f"expected some of {list(range(system.state_dim))}, got {self.outputs}."
+            )
+        if activation.__name__ not in ACTIVATIONS:
+            raise ConfigError(
+                "activation",
+                f"expected one of {sorted(ACTIVATIONS)}, got {activation.__name__!r}.",
+            )
         self.network = MLP(
             in_features=system.observation_dim + system.action_dim,
             out_features=len(self.outputs),
@@ -54,6 +77,23 @@ class ResidualMLP(nn.Module):
         )
         self.register_buffer("input_scale", torch.ones(system.observation_dim + system.action_dim))
         self.register_buffer("output_scale", torch.ones(len(self.outputs)))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Plain values from which :meth:`from_config` builds it again, without the weights."""
+        return {
+            "hidden_sizes": list(self.hidden_sizes),
+            "outputs": list(self.outputs),
+            "activation": self.activation.__name__,
+        }
+
+    @classmethod
+    def from_config(cls, system: System, config: Mapping[str, Any]) -> ResidualMLP:
+        """Build an untrained residual from :attr:`config`."""
+        name = config["activation"]
+        if name not in ACTIVATIONS:
+            raise ConfigError("activation", f"expected one of {sorted(ACTIVATIONS)}, got {name!r}.")
+        return cls(system, config["hidden_sizes"], config["outputs"], ACTIVATIONS[name])
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """F^r: ``[*batch, n], [*batch, m] -> [*batch, n]``."""
@@ -65,7 +105,7 @@ class ResidualMLP(nn.Module):
 
     @torch.no_grad()
     def set_scales(self, state: Tensor, action: Tensor, derivative: Tensor) -> None:
-        """Fit the scales to transitions: inputs to unit size, outputs to that of ``derivative``.
+        """Set the scales from transitions: inputs to unit size, outputs to that of ``derivative``.
 
         Args:
             state: states ``[N, n]``.
@@ -79,4 +119,4 @@ class ResidualMLP(nn.Module):
 
 def spread(values: Tensor) -> Tensor:
     """Standard deviation ``[k]`` of the columns of ``values`` ``[N, k]``, at least 1e-3."""
-    return values.std(0, correction=min(1, len(values) - 1)).clamp_min(1e-3)  # of one row, zero
+    return values.std(0, correction=min(1, len(values) - 1)).clamp_min(1e-3)  # one row: zero

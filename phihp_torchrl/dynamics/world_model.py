@@ -1,4 +1,4 @@
-"""A task and its dynamics as a TorchRL world model whose latent is the physical state."""
+"""A task and its dynamics as a TorchRL world model, whose latent state is the physical state."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import WorldModel
 
-from phihp_torchrl.tasks import Task
+from phihp_torchrl.dynamics.hybrid import HybridDynamics
+from phihp_torchrl.tasks import Step, Task, Transition
 
 
 class TaskWorldModel(WorldModel):
-    """Observation -> state -> next state, reward, termination -> observation, in TorchRL's form.
+    """A task's model as a TorchRL world model: observation and action to next observation, reward.
 
-    The encoder and decoder are the system's observation map, the heads are the task's functions, so
-    the dynamics are all that is learned. Besides the TensorDict interface of
-    :class:`torchrl.modules.WorldModel` it offers the same as pure functions of tensors, which
-    planners and imagination compile: :meth:`locate`, :meth:`observe`, :meth:`transition`.
+    The encoder and the decoder are the system's observation map, and the heads are functions of the
+    task, so that only the dynamics are learned. Besides the TensorDict interface of
+    :class:`torchrl.modules.WorldModel` it has pure functions of tensors, which planners and
+    imagination compile: :meth:`locate`, :meth:`observe` and :meth:`transition`.
 
     Args:
         task: the task.
@@ -27,50 +28,65 @@ class TaskWorldModel(WorldModel):
         >>> from tensordict import TensorDict
         >>> from phihp_torchrl import HybridDynamics, get_task
         >>> task = get_task("pendulum")
-        >>> model = TaskWorldModel(task, HybridDynamics.oracle(task))
+        >>> model = TaskWorldModel(task, HybridDynamics.hybrid(task))
         >>> td = TensorDict(observation=torch.tensor([[1.0, 0.0, 0.0]]), action=torch.zeros(1, 1))
         >>> model(td)["next", "reward"].shape
         torch.Size([1, 1])
     """
 
     def __init__(self, task: Task, dynamics: nn.Module) -> None:
-        next_state = ("next", "state")
+        reward, terminated = ("next", "reward"), ("next", "terminated")
+        step = TensorDictModule(
+            _Step(task, dynamics), ["state", "action"], [("next", "state"), reward, terminated]
+        )
         super().__init__(
-            encoder=TensorDictModule(task.system.locate, ["observation"], ["state"]),
-            dynamics=TensorDictModule(dynamics, ["state", "action"], [next_state]),
-            reward_head=TensorDictModule(
-                lambda state, action, next_state: task.reward(
-                    state, task.clip_action(action), next_state
-                ).unsqueeze(-1),
-                ["state", "action", next_state],
-                [("next", "reward")],
-            ),
-            done_head=TensorDictModule(
-                lambda state: task.is_terminated(state).unsqueeze(-1),
-                [next_state],
-                [("next", "terminated")],
-            ),
-            decoder=TensorDictModule(task.system.observe, [next_state], [("next", "observation")]),
+            encoder=TensorDictModule(task.locate, ["observation"], ["state"]),
+            # A step of the task gives all results at once, so TorchRL's heads only pass them on.
+            dynamics=step,
+            reward_head=TensorDictModule(nn.Identity(), [reward], [reward]),
+            done_head=TensorDictModule(nn.Identity(), [terminated], [terminated]),
+            decoder=TensorDictModule(task.observe, [("next", "state")], [("next", "observation")]),
         )
         self.task = task
 
     @property
+    def transitions(self) -> nn.Module:
+        """The dynamics, a module ``(state, action) -> next state``."""
+        return self.dynamics.module.dynamics
+
+    @property
     def compiles(self) -> bool:
-        """Whether :meth:`transition` compiles as one graph, as all but adaptive integrators do."""
-        integrator = getattr(self.dynamics.module, "integrator", None)
+        """Whether :meth:`transition` compiles as one graph; not with an adaptive integrator."""
+        integrator = getattr(self.transitions, "integrator", None)
         return integrator is None or integrator.compiles
 
     def locate(self, observation: Tensor) -> Tensor:
         """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""
-        return self.task.system.locate(observation)
+        return self.task.locate(observation)
 
     def observe(self, state: Tensor) -> Tensor:
         """State ``[*batch, n]`` -> observation ``[*batch, o]``."""
-        return self.task.system.observe(state)
+        return self.task.observe(state)
 
-    def transition(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def transition(self, state: Tensor, action: Tensor) -> Transition:
         """One step: next state ``[*batch, n]``, reward and (bool) terminated, each ``[*batch]``."""
-        action = self.task.clip_action(action)
-        next_state = self.dynamics.module(state, action)
-        reward = self.task.reward(state, action, next_state)
-        return next_state, reward, self.task.is_terminated(next_state)
+        return self.task.transition(_step_of(self.transitions), state, action)
+
+
+class _Step(nn.Module):
+    """A step for TensorDicts, with reward and termination of shape ``[*batch, 1]``."""
+
+    def __init__(self, task: Task, dynamics: nn.Module) -> None:
+        super().__init__()
+        self.task, self.dynamics = task, dynamics
+
+    def forward(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        next_state, reward, terminated = self.task.transition(
+            _step_of(self.dynamics), state, action
+        )
+        return next_state, reward.unsqueeze(-1), terminated.unsqueeze(-1)
+
+
+def _step_of(dynamics: nn.Module) -> Step:
+    # HybridDynamics.forward clips the action, which the task has clipped already.
+    return dynamics.step if isinstance(dynamics, HybridDynamics) else dynamics

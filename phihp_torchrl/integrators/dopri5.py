@@ -6,32 +6,41 @@ import torch
 from torch import Tensor
 from torchdiffeq import odeint
 
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.integrators.base import Derivative, Integrator, StateLayout
 
 
 class Dopri5(Integrator):
-    """Adaptive reference solver, for accuracy rather than speed.
+    """Adaptive Dormand-Prince solver of order 5, for reference results rather than for speed.
 
-    It chooses its inner steps by the worst error in the batch, so results depend on the batch
-    within the tolerances, and it never compiles as one graph. Velocity limits apply after the step.
+    It chooses its inner steps by the largest error in the batch, so results depend on the rest of
+    the batch, within the tolerances, and it does not compile as one graph. Velocity limits are
+    applied after the control step.
 
-    Inner steps are never shorter than a hundredth of the step: dry friction jumps where a velocity
-    changes sign, and a cart that sticks there would ask for a hundred thousand of them.
+    Inner steps are never shorter than a hundredth of the control step: dry friction jumps where a
+    velocity changes sign, and a cart that sticks there would need a hundred thousand inner steps.
 
     Args:
         rtol: relative tolerance of an inner step.
         atol: absolute tolerance of an inner step, in the units of the state.
 
     Raises:
-        ValueError: for tolerances that are not positive, and on a call when any state of the batch
+        ConfigError: for tolerances that are not positive.
+        ValueError: on a call, when any state of the batch
             is or becomes non-finite.
+
+    Examples:
+        >>> grow = Dopri5()(lambda s: s, torch.ones(1), 1.0, StateLayout(size=1))
+        >>> round(grow.item(), 3)  # e is 2.718
+        2.718
     """
 
+    name = "dopri5"
     compiles = False
 
     def __init__(self, rtol: float = 1e-6, atol: float = 1e-8) -> None:
         if not (rtol > 0 and atol > 0):
-            raise ValueError(f"rtol, atol: expected positive tolerances, got {rtol}, {atol}.")
+            raise ConfigError("rtol, atol", f"expected positive tolerances, got {rtol}, {atol}.")
         self.rtol = rtol
         self.atol = atol
 
@@ -49,6 +58,6 @@ class Dopri5(Integrator):
                 atol=self.atol,
                 options={"min_step": 0.01 * time_step},
             )
-        except AssertionError as error:  # torchdiffeq's way to say so
+        except AssertionError as error:  # torchdiffeq raises these for non-finite values
             raise ValueError(f"state: expected finite values while solving; {error}.") from error
         return layout.clip(trajectory[-1])

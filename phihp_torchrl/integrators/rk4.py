@@ -4,13 +4,27 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from phihp_torchrl.integrators.base import Derivative, Integrator, StateLayout
+from phihp_torchrl.integrators.base import Derivative, FixedStepIntegrator, StateLayout
 
 
-class RK4(Integrator):
-    """Classical Runge-Kutta of order 4; velocity limits apply after the step."""
+class RK4(FixedStepIntegrator):
+    r"""Classical Runge-Kutta method of order 4; velocity limits are applied after each step.
 
-    def __call__(
+    .. math:: s' = s + \tfrac{\Delta t}{6} (k_1 + 2 k_2 + 2 k_3 + k_4)
+
+    Args:
+        substeps: solver steps in a control step.
+
+    Examples:
+        >>> import torch
+        >>> grow = RK4(substeps=4)(lambda s: s, torch.ones(1), 1.0, StateLayout(size=1))
+        >>> round(grow.item(), 3)  # e is 2.718
+        2.718
+    """
+
+    name = "rk4"
+
+    def step(
         self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
     ) -> Tensor:
         half = 0.5 * time_step

@@ -11,12 +11,18 @@ from phihp_torchrl.systems.base import Constants, System
 
 
 class Acrobot(System):
-    r"""Two links, both joints driven; :math:`\theta_1 = \theta_2 = 0` hangs down.
+    r"""A two-link arm, both joints driven (paper, equation 7); it hangs at :math:`\theta = 0`.
 
-    .. math:: M(q)\,\ddot q + c(q, \dot q) = \tau - \mathrm{diag}(b)\,\dot q
+    .. math:: M(q)\,\ddot q + c(q, \dot q) = \tau
 
-    with the friction :math:`b` outside F^p. Without torque on the first joint and without friction
-    these are gymnasium's Acrobot equations in their ``book`` form. Units: rad, rad/s, N·m, kg, m.
+    Without torque on the first joint these are gymnasium's Acrobot equations in their ``book``
+    form. Units: rad, rad/s, N·m, kg, m, kg·m².
+
+    Examples:
+        >>> import torch
+        >>> acrobot = Acrobot()  # hanging down at rest, it stays there
+        >>> acrobot.prior(torch.zeros(4), torch.zeros(2), acrobot.constants).abs().max()
+        tensor(0.)
     """
 
     state_names = ("theta1", "theta2", "theta1_dot", "theta2_dot")
@@ -33,7 +39,6 @@ class Acrobot(System):
         "inertia1": 1.0,
         "inertia2": 1.0,
     }
-    default_friction = {"joint1": 0.01, "joint2": 0.05}
 
     def prior(self, state: Tensor, action: Tensor, constants: Constants) -> Tensor:
         theta1, theta2, omega1, omega2 = state.unbind(-1)
@@ -45,26 +50,15 @@ class Acrobot(System):
         swirl = c["coupling"] * sin2
         rest1 = torque1 - pull1 + swirl * omega2 * (omega2 + 2.0 * omega1)
         rest2 = torque2 - pull2 - swirl * omega1.square()
-        alpha1, alpha2 = _solve_inertia(theta2, rest1, rest2, c)
+        alpha1, alpha2 = solve_inertia(theta2, rest1, rest2, c)
         return torch.stack([omega1, omega2, alpha1, alpha2], -1)
-
-    def friction(self, state: Tensor, action: Tensor) -> Tensor:
-        _, theta2, omega1, omega2 = state.unbind(-1)
-        alpha1, alpha2 = _solve_inertia(
-            theta2,
-            -self.friction_constants["joint1"] * omega1,
-            -self.friction_constants["joint2"] * omega2,
-            self.identifiable(self.constants),
-        )
-        zero = torch.zeros_like(omega1)
-        return torch.stack([zero, zero, alpha1, alpha2], -1)
 
     def torques(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Torques on both joints for an action ``[*batch, m]``."""
         return action[..., 0], action[..., 1]
 
     def identifiable(self, constants: Constants) -> dict[str, Any]:
-        """The five base parameters of a two-link arm: the motion tells no more than these."""
+        """The five base parameters of a two-link arm, which are all that its motion determines."""
         m1, m2, l1 = constants["mass1"], constants["mass2"], constants["length1"]
         lc1, lc2, g = constants["center1"], constants["center2"], constants["gravity"]
         return {
@@ -77,7 +71,12 @@ class Acrobot(System):
 
 
 class ElbowAcrobot(Acrobot):
-    """The classic Acrobot: only the second joint, the elbow, is driven."""
+    """The classic Acrobot: only the second joint, the elbow, is driven (paper, appendix B).
+
+    Examples:
+        >>> ElbowAcrobot().action_dim
+        1
+    """
 
     action_names = ("torque2",)
 
@@ -85,10 +84,20 @@ class ElbowAcrobot(Acrobot):
         return torch.zeros_like(action[..., 0]), action[..., 0]
 
 
-def _solve_inertia(
+def solve_inertia(
     theta2: Tensor, rest1: Tensor, rest2: Tensor, base: dict[str, Any]
 ) -> tuple[Tensor, Tensor]:
-    """Solve M(q) x = rest for the symmetric 2x2 inertia of the arm."""
+    """Solve M(q) x = rest for the symmetric 2x2 inertia matrix M(q) of the arm.
+
+    Args:
+        theta2: angle of the second joint, ``[*batch]``.
+        rest1: right side of the first equation, N·m, ``[*batch]``.
+        rest2: right side of the second equation, N·m, ``[*batch]``.
+        base: the base parameters, as :meth:`Acrobot.identifiable` returns them.
+
+    Returns:
+        Both components of x, rad/s², each ``[*batch]``.
+    """
     coupled = base["coupling"] * theta2.cos()
     m11 = base["inertia_a"] + base["inertia_b"] + 2.0 * coupled
     m12 = base["inertia_b"] + coupled

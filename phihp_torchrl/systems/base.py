@@ -1,37 +1,97 @@
-"""What a physical system declares: its state, its constants, F^p and F^r."""
+"""A controlled system as far as it is known: names, geometry, equations F^p and first guesses."""
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.integrators import StateLayout
 
 Constants = Mapping[str, Any]
 """Physical constants by name: floats, or tensors that broadcast against ``[*batch]``."""
 
 
-class System:
-    """A controlled system ds/dt = F^p(s, a) + F^r(s, a) (paper, section 4.1 and appendix B).
+@dataclass(frozen=True)
+class Constant:
+    """A first guess of a physical constant, and the range in which it is learned.
 
-    A subclass declares the names below and writes :meth:`prior`; a system with friction also writes
-    :meth:`friction`. One whose equations are not to be known writes :meth:`derivative` instead, and
-    only methods that need no prior can learn it. All are pure functions of tensors with any leading
-    batch dimensions, so that they differentiate, compile and run in any dtype. The prior is given
-    its constants and can not see those of the world; the friction is known to the world alone.
+    A constant is free (the default: any positive number), bounded (any number between ``low`` and
+    ``high``, which may be negative) or fixed (known, and not learned).
 
     Args:
-        constants: true constants that differ from the declared ones, by name.
-        friction_constants: friction coefficients that differ from the declared ones, by name.
+        guess: the first guess, in the unit of the constant.
+        low: lower limit, exclusive.
+        high: upper limit, exclusive; infinite for none, which requires ``low`` = 0.
+        fixed: whether the guess is known to be the value, which is then not learned.
 
     Raises:
-        TypeError: for a class that has neither a prior nor a derivative.
-        ValueError: for a name that the system does not declare, or a constant that is not positive
-            and finite.
+        ConfigError: for a guess that is not finite or not between the limits, and for a lower limit
+            other than 0 without an upper one.
+
+    Examples:
+        >>> Constant(9.81, fixed=True)
+        Constant(guess=9.81, low=0.0, high=inf, fixed=True)
+        >>> Constant(0.0, low=-0.2, high=0.2).bounded
+        True
+    """
+
+    guess: float
+    low: float = 0.0
+    high: float = math.inf
+    fixed: bool = False
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.guess) and math.isfinite(self.low)):
+            raise ConfigError("guess", f"expected finite numbers, got {self}.")
+        if self.high == math.inf and self.low != 0.0 and not self.fixed:
+            raise ConfigError("high", f"expected a finite limit above low={self.low}, got none.")
+        if not self.fixed and not self.low < self.guess < self.high:
+            raise ConfigError(
+                "guess", f"expected a value between {self.low} and {self.high}, got {self.guess}."
+            )
+
+    @property
+    def bounded(self) -> bool:
+        """Whether there is an upper limit."""
+        return math.isfinite(self.high)
+
+
+class System:
+    """What is known of a system whose state follows ds/dt = F^p(s, a) + F^r(s, a).
+
+    A subclass declares the names below and implements :meth:`prior`, the known part F^p (paper,
+    section 4.1). It contains neither friction nor true values of the constants: a model learns
+    them from data, and a *simulated* world has them in its
+    :class:`~phihp_torchrl.worlds.Plant`. A system whose equations are unknown does not implement
+    :meth:`prior`; methods without a prior can still learn it.
+
+    All functions are pure functions of tensors with any leading batch dimensions, without ``if`` on
+    values and without ``.item()``, so that they differentiate, compile and run in any dtype.
+
+    Args:
+        constants: first guesses that differ from the declared ones, by name.
+
+    Raises:
+        ConfigError: for a name that the system does not declare, or a guess out of its limits.
+
+    Examples:
+        >>> class Cart(System):
+        ...     state_names, action_names = ("x", "x_dot"), ("force",)
+        ...     velocity_of = {"x": "x_dot"}
+        ...     default_constants = {"mass": 2.0}
+        ...
+        ...     def prior(self, state, action, constants):
+        ...         return torch.stack([state[..., 1], action[..., 0] / constants["mass"]], -1)
+        >>> cart = Cart(constants={"mass": 1.5})
+        >>> cart.prior(torch.zeros(4, 2), torch.ones(4, 1), cart.constants).shape
+        torch.Size([4, 2])
     """
 
     state_names: ClassVar[tuple[str, ...]]
@@ -39,55 +99,59 @@ class System:
     action_names: ClassVar[tuple[str, ...]]
     """Components of the action, in order."""
     angles: ClassVar[tuple[str, ...]] = ()
-    """State components that live on a circle, in radians."""
+    """State components that live on a circle, in radians; observed as cosine and sine."""
     velocity_of: ClassVar[Mapping[str, str]] = {}
     """The velocity that belongs to each position."""
-    default_constants: ClassVar[Mapping[str, float]] = {}
-    """The constants of F^p, all positive, with the values of SPEC's worlds."""
-    default_friction: ClassVar[Mapping[str, float]] = {}
-    """The coefficients of F^r, not negative."""
+    default_constants: ClassVar[Mapping[str, float | Constant]] = {}
+    """First guesses of the constants of F^p; a plain number is a free :class:`Constant`."""
 
-    def __init__(
-        self,
-        constants: Mapping[str, float] | None = None,
-        friction_constants: Mapping[str, float] | None = None,
-    ) -> None:
-        if not self.has_prior and type(self).derivative is System.derivative:
-            raise TypeError(f"{type(self).__name__}: expected a method `prior` or `derivative`.")
-        self.constants = _override("constants", self.default_constants, constants)
-        self.friction_constants = _override(
-            "friction_constants", self.default_friction, friction_constants
-        )
-        if any(not 0 < value < math.inf for value in self.constants.values()):
-            raise ValueError(f"constants: expected positive, finite values, got {self.constants}.")
-        if any(not 0 <= value < math.inf for value in self.friction_constants.values()):
-            raise ValueError(
-                "friction_constants: expected non-negative, finite values, "
-                f"got {self.friction_constants}."
-            )
+    def __init__(self, constants: Mapping[str, float] | None = None) -> None:
+        self.ranges = {
+            name: value if isinstance(value, Constant) else self._checked(name, Constant, value)
+            for name, value in self.default_constants.items()
+        }
+        self._guess(constants)
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """The first guesses by name."""
+        return {name: constant.guess for name, constant in self.ranges.items()}
+
+    def with_constants(self, constants: Mapping[str, float]) -> System:
+        """Return a copy of this system with other first guesses, by name.
+
+        Raises:
+            ConfigError: for a name that the system does not declare, or a guess out of its limits.
+        """
+        other = copy.copy(self)
+        other._guess(constants)
+        return other
+
+    def _guess(self, constants: Mapping[str, float] | None) -> None:
+        guesses = override("constants", self.constants, constants)
+        ranges = self.ranges.items()
+        self.ranges = {n: self._checked(n, replace, c, guess=guesses[n]) for n, c in ranges}
 
     @property
     def has_prior(self) -> bool:
-        """Whether F^p is known."""
+        """Whether the system implements F^p."""
         return type(self).prior is not System.prior
 
     def prior(self, state: Tensor, action: Tensor, constants: Constants) -> Tensor:
-        """F^p: the frictionless equations ``[*batch, n], [*batch, m] -> [*batch, n]``."""
+        """F^p, the known part of ds/dt: ``[*batch, n], [*batch, m] -> [*batch, n]``.
+
+        Args:
+            state: states in the order of :attr:`state_names`.
+            action: actions in physical units.
+            constants: current values of the constants, by name.
+        """
         raise NotImplementedError(f"{type(self).__name__}: this system has no prior.")
 
-    def friction(self, state: Tensor, action: Tensor) -> Tensor:
-        """F^r of the simulated world: what the prior leaves out, ``[*batch, n]``."""
-        return torch.zeros_like(state)
-
     def identifiable(self, constants: Constants) -> dict[str, Any]:
-        """The combinations of constants that the motion determines; by default each by itself."""
+        """The combinations of constants that the motion determines; by default each constant."""
         return dict(constants)
 
-    def derivative(self, state: Tensor, action: Tensor) -> Tensor:
-        """ds/dt of the real world: F^p with the true constants, and friction, ``[*batch, n]``."""
-        return self.prior(state, action, self.constants) + self.friction(state, action)
-
-    # What follows from the declarations.
+    # Properties and maps that follow from the declarations.
 
     @property
     def state_dim(self) -> int:
@@ -101,7 +165,7 @@ class System:
 
     @property
     def observation_dim(self) -> int:
-        """Number of observation components: an angle counts twice."""
+        """Number of observation components, ``o``: an angle counts twice."""
         return self.state_dim + len(self.angles)
 
     @property
@@ -114,19 +178,31 @@ class System:
         """Indices of the velocities in the state."""
         return tuple(self.state_names.index(name) for name in self.velocity_of.values())
 
-    def layout(self, velocity_limits: Mapping[str, float] | None = None) -> StateLayout:
-        """The state's layout for an integrator, with limits on ``|velocity|`` by name."""
-        limits = dict.fromkeys(self.velocity_of.values(), float("inf"))
-        limits = _override("velocity_limits", limits, velocity_limits)
+    def layout(
+        self, velocity_limits: Mapping[str, float | tuple[float, float]] | None = None
+    ) -> StateLayout:
+        """Return the layout of the state for an integrator.
+
+        Args:
+            velocity_limits: limits by the velocity's name: the largest ``|velocity|``, or the
+                lowest and the highest velocity.
+
+        Raises:
+            ConfigError: for a name that is not a velocity, and for limits in the wrong order.
+        """
+        names = list(self.velocity_of.values())
+        given = dict(velocity_limits or {})
+        if unknown := sorted(set(given) - set(names)):
+            raise ConfigError("velocity_limits", f"unknown {unknown}, expected some of {names}.")
         index = self.state_names.index
         return StateLayout(
             size=self.state_dim,
             pairs=tuple((index(q), index(v)) for q, v in self.velocity_of.items()),
-            limits=tuple(limits[v] for v in self.velocity_of.values()),
+            limits=tuple(given.get(name, math.inf) for name in names),
         )
 
     def observe(self, state: Tensor) -> Tensor:
-        """Map a state ``[*batch, n]`` to an observation: each angle becomes (cos, sin)."""
+        """Map a state ``[*batch, n]`` to an observation ``[*batch, o]``: angles as (cos, sin)."""
         angles = self.angle_indices
         columns: list[Tensor] = []
         for i, component in enumerate(state.unbind(-1)):
@@ -144,23 +220,37 @@ class System:
         return torch.stack(state, -1)
 
     def difference(self, state: Tensor, other: Tensor) -> Tensor:
-        """``state - other`` ``[*batch, n]``, angles on the circle, in [-pi, pi)."""
+        """``state - other`` ``[*batch, n]``, with differences of angles in [-pi, pi)."""
         delta = list((state - other).unbind(-1))
         for i in self.angle_indices:
             delta[i] = wrap(delta[i])
         return torch.stack(delta, -1)
 
+    @staticmethod
+    def _checked(name: str, make: Callable[..., Constant], *args: Any, **options: Any) -> Constant:
+        """A constant, or an error by its name."""
+        try:
+            return make(*args, **options)
+        except ConfigError as error:
+            raise ConfigError(f"constants.{name}", error.reason) from error
+
 
 def wrap(angle: Tensor) -> Tensor:
-    """Map angles in radians to [-pi, pi)."""
+    """Map angles in radians to [-pi, pi), ``[*batch] -> [*batch]``.
+
+    Examples:
+        >>> wrap(torch.tensor([3.5, -7.0]))
+        tensor([-2.7832, -0.7168])
+    """
     return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
 
 
-def _override(
+def override(
     what: str, defaults: Mapping[str, float], changes: Mapping[str, float] | None
 ) -> dict[str, float]:
+    """Return named numbers with some of them changed; an unknown name is an error of ``what``."""
     changes = changes or {}
     unknown = sorted(set(changes) - set(defaults))
     if unknown:
-        raise ValueError(f"{what}: unknown {unknown}, expected some of {sorted(defaults)}.")
+        raise ConfigError(what, f"unknown {unknown}, expected some of {sorted(defaults)}.")
     return {name: float(changes.get(name, value)) for name, value in defaults.items()}

@@ -11,12 +11,16 @@ from phihp_torchrl.systems.base import Constants, System
 
 
 class Pendulum(System):
-    r"""A rod on a driven joint; :math:`\theta = 0` is upright.
+    r"""A rod on a driven joint (paper, equation 6); :math:`\theta = 0` is upright.
 
-    .. math::
-        \ddot\theta = \frac{3g}{2l}\sin\theta + \frac{3a}{ml^2} - \frac{\eta\dot\theta}{ml^2}
+    .. math:: \ddot\theta = \frac{3g}{2l}\sin\theta + \frac{3a}{ml^2}
 
-    The last term is the friction. Units: rad, rad/s, N·m, kg, m.
+    Units: rad, rad/s, N·m, kg, m.
+
+    Examples:
+        >>> pendulum = Pendulum()  # upright at rest, pushed with 1 N·m
+        >>> pendulum.prior(torch.zeros(2), torch.ones(1), pendulum.constants)
+        tensor([0., 3.])
     """
 
     state_names = ("theta", "theta_dot")
@@ -24,7 +28,6 @@ class Pendulum(System):
     angles = ("theta",)
     velocity_of = {"theta": "theta_dot"}
     default_constants = {"gravity": 10.0, "mass": 1.0, "length": 1.0}
-    default_friction = {"joint": 0.5}
 
     def prior(self, state: Tensor, action: Tensor, constants: Constants) -> Tensor:
         theta, theta_dot = state.unbind(-1)
@@ -32,13 +35,7 @@ class Pendulum(System):
         theta_ddot = c["gravity_gain"] * theta.sin() + c["torque_gain"] * action[..., 0]
         return torch.stack([theta_dot, theta_ddot], -1)
 
-    def friction(self, state: Tensor, action: Tensor) -> Tensor:
-        theta_dot = state[..., 1]
-        inertia = self.constants["mass"] * self.constants["length"] ** 2
-        slowdown = -self.friction_constants["joint"] * theta_dot / inertia
-        return torch.stack([torch.zeros_like(theta_dot), slowdown], -1)
-
     def identifiable(self, constants: Constants) -> dict[str, Any]:
-        """The paper's C_g and C_i: only these two can be told from the motion."""
+        """The paper's C_g and C_i, which are all that the motion determines."""
         g, m, l = constants["gravity"], constants["mass"], constants["length"]
         return {"gravity_gain": 1.5 * g / l, "torque_gain": 3.0 / (m * l**2)}

@@ -1,9 +1,11 @@
-"""Tasks as data: a system with reward, termination, resets and limits, known by name."""
+"""Tasks on a system: reward, termination, limits and time step, registered by name."""
 
 from __future__ import annotations
 
-from phihp_torchrl.tasks import acrobot, cartpole, pendulum  # noqa: F401  (they register themselves)
-from phihp_torchrl.tasks.base import Box, RewardFn, Task, TerminatedFn
-from phihp_torchrl.tasks.registry import get_task, list_tasks, register_task
+from phihp_torchrl.tasks import acrobot, cartpole, pendulum  # (they register themselves)
+from phihp_torchrl.tasks.base import RewardFn, Step, Task, TerminatedFn, Transition
+from phihp_torchrl.tasks.bounds import ActionBounds
+from phihp_torchrl.tasks.box import Box
+from phihp_torchrl.tasks.registry import find_task, get_task, list_tasks, register_task
 
-__all__ = ["Box", "RewardFn", "Task", "TerminatedFn", "get_task", "list_tasks", "register_task"]
+__all__ = ["ActionBounds", "Box", "Task", "Transition", "get_task", "list_tasks", "register_task"]

@@ -1,102 +1,87 @@
-"""What a task adds to a system: reward, termination, resets, limits and time."""
+"""A task on a system: reward, termination, limits and time step, and how a step is composed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from phihp_torchrl.integrators import Integrator, StateLayout, make_integrator
+from phihp_torchrl.config import ConfigError, check_count, check_positive
+from phihp_torchrl.integrators import StateLayout
 from phihp_torchrl.systems import System
+from phihp_torchrl.tasks.bounds import ActionBounds
+from phihp_torchrl.tasks.box import Box
 
 RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """``state [*batch, n], action [*batch, m], next_state [*batch, n] -> reward [*batch]``."""
 TerminatedFn = Callable[[Tensor], Tensor]
 """``next_state [*batch, n] -> bool [*batch]``."""
+Step = Callable[[Tensor, Tensor], Tensor]
+"""``state [*batch, n], action [*batch, m] -> next_state [*batch, n]``; the action is in bounds."""
 
 
-@dataclass(frozen=True)
-class Box:
-    """An axis-aligned box of states, sampled uniformly.
+class Transition(NamedTuple):
+    """The result of one step of a task.
 
     Args:
-        low: lower corner, one number per state component.
-        high: upper corner.
+        next_state: state after the step, ``[*batch, n]``.
+        reward: reward of the step, ``[*batch]``.
+        terminated: whether the step ends the episode, bool ``[*batch]``.
 
     Examples:
-        >>> Box(low=(-1.0, 0.0), high=(1.0, 0.0)).sample([5]).shape
-        torch.Size([5, 2])
+        >>> from phihp_torchrl import get_task
+        >>> stay = lambda state, action: state
+        >>> found = get_task("pendulum").transition(stay, torch.tensor([0.5, 0.0]), torch.ones(1))
+        >>> round(found.reward.item(), 3), found.terminated.item()
+        (-0.251, False)
     """
 
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if len(self.low) != len(self.high):
-            raise ValueError(f"low, high: expected equal lengths, got {self.low}, {self.high}.")
-        pairs = zip(self.low, self.high, strict=True)
-        if any(not -math.inf < low <= high < math.inf for low, high in pairs):
-            raise ValueError(
-                f"low, high: expected finite low <= high, got {self.low}, {self.high}."
-            )
-
-    @classmethod
-    def around(cls, center: tuple[float, ...], radius: tuple[float, ...]) -> Box:
-        """The box ``center ± radius``."""
-        if len(center) != len(radius):
-            raise ValueError(f"center, radius: expected equal lengths, got {center}, {radius}.")
-        pairs = list(zip(center, radius, strict=True))
-        return cls(tuple(c - r for c, r in pairs), tuple(c + r for c, r in pairs))
-
-    def sample(
-        self,
-        shape: torch.Size | list[int],
-        *,
-        generator: torch.Generator | None = None,
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str | None = None,
-    ) -> Tensor:
-        """Draw states ``[*shape, n]``."""
-        low = torch.tensor(self.low, dtype=dtype, device=device)
-        high = torch.tensor(self.high, dtype=dtype, device=device)
-        noise = torch.rand([*shape, len(self.low)], generator=generator, dtype=dtype, device=device)
-        return low + (high - low) * noise
+    next_state: Tensor
+    reward: Tensor
+    terminated: Tensor
 
 
 @dataclass(frozen=True)
 class Task:
-    """A control task on a :class:`~phihp_torchrl.systems.System`, as data; SPEC's are built so.
+    """A control task on a :class:`~phihp_torchrl.systems.System`, as data.
+
+    A task describes the goal and not the world: it contains neither friction nor how a world is
+    simulated. Learning, imagination and planning use the system through the task, so that all of
+    them share one state, one observation and one definition of a step (:meth:`transition`).
 
     Args:
-        name: what recipes call it, e.g. ``"pendulum-swingup"``.
-        system: the physics, with the world's true constants and friction.
-        action_high: bound on each ``|action|`` component, in physical units.
-        time_step: seconds an action is held.
-        max_steps: steps after which an episode is truncated (never terminated).
-        reset: where episodes start.
+        name: name in settings, e.g. ``"pendulum-swingup"``.
+        system: the system, as far as it is known.
+        action_high: upper bound of each action, in physical units.
+        time_step: seconds for which an action is held.
+        max_steps: steps after which an episode is truncated, which is not a termination.
+        reset: box of the states in which episodes start.
         reward: reward of a transition, a pure function of tensors.
-        terminated: whether the next state ends the episode; ``None`` if none does.
-        velocity_limits: bound on ``|velocity|`` by name; absent velocities have none.
-        coverage: the states that imagination should know, a wide box around all that the task
-            meets. Defaults to the reset box.
-        goal: states around the goal, worth imagining from where the goal is hard to reach.
-        exploration_reward: what to plan for while collecting data, where ``reward`` is too sparse
-            to move the system. Defaults to ``reward``.
-        integrator: how the world integrates, by name.
-        env_id: id of the gymnasium environment of this world, if there is one.
+        terminated: whether the next state ends the episode; ``None`` if episodes never terminate.
+        velocity_limits: by name of the velocity, the largest ``|velocity|``, or the lowest and the
+            highest velocity; velocities without an entry are not limited.
+        coverage: wide box around the states that the task visits, from which imagined episodes
+            start as well; ``None`` for no such box.
+        goal: box around the goal, from which imagined episodes start as well; useful where the goal
+            is hard to reach.
+        exploration_reward: reward that data collection plans for, where ``reward`` is too sparse to
+            make the system move. Defaults to ``reward``.
+        action_low: lower bound of each action. Defaults to the negative of ``action_high``.
 
     Raises:
-        ValueError: for a field whose length or range does not fit the system, named in the message.
+        ConfigError: for a field whose length or range does not fit the system; the message names
+            the field.
 
     Examples:
         >>> from phihp_torchrl import get_task
         >>> task = get_task("pendulum-swingup")
         >>> state = task.reset.sample([3])
-        >>> next_state = task.step(state, torch.zeros(3, 1))
-        >>> task.reward(state, torch.zeros(3, 1), next_state).shape
+        >>> stay = lambda state, action: state
+        >>> task.transition(stay, state, torch.zeros(3, 1)).reward.shape
         torch.Size([3])
     """
 
@@ -108,66 +93,116 @@ class Task:
     reset: Box
     reward: RewardFn
     terminated: TerminatedFn | None = None
-    velocity_limits: Mapping[str, float] = field(default_factory=dict, hash=False)
+    velocity_limits: Mapping[str, float | tuple[float, float]] = field(
+        default_factory=dict, hash=False
+    )
     coverage: Box | None = None
     goal: Box | None = None
     exploration_reward: RewardFn | None = None
-    integrator: str = "semi_implicit_euler"
-    env_id: str | None = None
-
-    def __post_init__(self) -> None:
-        if len(self.action_high) != self.system.action_dim:
-            raise ValueError(
-                f"action_high: expected {self.system.action_dim} values for "
-                f"{self.system.action_names}, got {self.action_high}."
-            )
-        if any(not 0 < high < math.inf for high in self.action_high):
-            raise ValueError(
-                f"action_high: expected positive, finite bounds, got {self.action_high}."
-            )
-        if not 0 < self.time_step < math.inf:
-            raise ValueError(
-                f"time_step: expected a positive number of seconds, got {self.time_step}."
-            )
-        if not (isinstance(self.max_steps, int) and self.max_steps > 0):
-            raise ValueError(
-                f"max_steps: expected a positive whole number of steps, got {self.max_steps}."
-            )
-        for name in ("reset", "coverage", "goal"):
-            box = getattr(self, name)
-            if box is not None and len(box.low) != self.system.state_dim:
-                raise ValueError(
-                    f"{name}: expected {self.system.state_dim} values for "
-                    f"{self.system.state_names}, got {len(box.low)}."
-                )
-        make_integrator(self.integrator)
-        object.__setattr__(self, "velocity_limits", dict(self.velocity_limits))
-        object.__setattr__(self, "layout", self.system.layout(self.velocity_limits))
+    action_low: tuple[float, ...] | None = None
 
     layout: StateLayout = field(init=False, repr=False, compare=False)
     """Positions, velocities and their limits, for integrators."""
 
-    def step(
-        self, state: Tensor, action: Tensor, integrator: str | Integrator | None = None
-    ) -> Tensor:
-        """One step of the real world with friction, ``[*batch, n], [*batch, m] -> [*batch, n]``.
+    def __post_init__(self) -> None:
+        self._set_bounds()
+        check_positive(self, "time_step")
+        check_count(self, "max_steps")
+        for name in ("reset", "coverage", "goal"):
+            box = getattr(self, name)
+            if box is not None and len(box.low) != self.state_dim:
+                raise ConfigError(
+                    name,
+                    f"expected {self.state_dim} values for {self.system.state_names}, "
+                    f"got {len(box.low)}.",
+                )
+        object.__setattr__(self, "velocity_limits", dict(self.velocity_limits))
+        object.__setattr__(self, "layout", self.system.layout(self.velocity_limits))
 
-        The action is clipped to its bounds and held for ``time_step`` seconds.
+    def _set_bounds(self) -> None:
+        names = self.system.action_names
+        for name in ("action_high", "action_low"):
+            given = getattr(self, name)
+            if given is None:
+                continue
+            if len(given) != len(names):
+                raise ConfigError(name, f"expected {len(names)} values for {names}, got {given}.")
+            if not all(math.isfinite(value) for value in given):
+                raise ConfigError(name, f"expected finite bounds, got {given}.")
+            object.__setattr__(self, name, tuple(float(value) for value in given))
+        if self.action_low is None:
+            if not all(high > 0 for high in self.action_high):
+                raise ConfigError(
+                    "action_high",
+                    f"expected positive bounds where action_low is not given, "
+                    f"got {self.action_high}.",
+                )
+            object.__setattr__(self, "action_low", tuple(-high for high in self.action_high))
+        pairs = zip(self.action_low or (), self.action_high, strict=True)
+        if not all(low < high for low, high in pairs):
+            raise ConfigError(
+                "action_low", f"expected values below {self.action_high}, got {self.action_low}."
+            )
+
+    # Sizes and maps of states, observations and actions, for everything that uses a task.
+
+    @property
+    def state_dim(self) -> int:
+        """Number of state components, ``n``."""
+        return self.system.state_dim
+
+    @property
+    def action_dim(self) -> int:
+        """Number of action components, ``m``."""
+        return self.system.action_dim
+
+    @property
+    def observation_dim(self) -> int:
+        """Number of observation components, ``o``."""
+        return self.system.observation_dim
+
+    @property
+    def bounds(self) -> ActionBounds:
+        """Bounds of the action, float32 ``[m]``, on the CPU."""
+        return ActionBounds.from_limits(self.action_low or (), self.action_high)
+
+    def observe(self, state: Tensor) -> Tensor:
+        """State ``[*batch, n]`` -> observation ``[*batch, o]``."""
+        return self.system.observe(state)
+
+    def locate(self, observation: Tensor) -> Tensor:
+        """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""
+        return self.system.locate(observation)
+
+    def difference(self, state: Tensor, other: Tensor) -> Tensor:
+        """``state - other`` ``[*batch, n]``, with differences of angles in [-pi, pi)."""
+        return self.system.difference(state, other)
+
+    # One step of the task.
+
+    def transition(self, step: Step, state: Tensor, action: Tensor) -> Transition:
+        """Take one step of the task, in which ``step`` (of a world or a model) moves the state.
+
+        This is the only place where an action is clipped, the state is moved, the reward is
+        computed and the termination is decided.
+
+        Args:
+            step: ``(state, action in bounds) -> next state``.
+            state: the state before the step, ``[*batch, n]``.
+            action: the action, in physical units, ``[*batch, m]``; it is clipped to its bounds.
+
+        Returns:
+            The next state, the reward and whether the episode has terminated.
         """
         action = self.clip_action(action)
-        return make_integrator(integrator or self.integrator)(
-            lambda s: self.system.derivative(s, action), state, self.time_step, self.layout
-        )
+        next_state = step(state, action)
+        reward = self.reward(state, action, next_state)
+        return Transition(next_state, reward, self.is_terminated(next_state))
 
     def clip_action(self, action: Tensor) -> Tensor:
         """Clip an action ``[*batch, m]`` to its bounds."""
-        return torch.stack(
-            [
-                a.clamp(-high, high)
-                for a, high in zip(action.unbind(-1), self.action_high, strict=True)
-            ],
-            -1,
-        )
+        limits = zip(action.unbind(-1), self.action_low or (), self.action_high, strict=True)
+        return torch.stack([a.clamp(low, high) for a, low, high in limits], -1)
 
     def is_terminated(self, next_state: Tensor) -> Tensor:
         """Whether ``next_state`` ``[*batch, n]`` ends the episode, bool ``[*batch]``."""

@@ -1,4 +1,7 @@
-"""CartPole, CartPoleSwingup and its published variant (SPEC section 1)."""
+"""CartPole, CartPoleSwingup and its published variant (paper, appendix B; docs/tasks.md).
+
+The paper prints CartPoleSwingup's reward without the minus sign in its exponent.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,14 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.systems import CartPole
-from phihp_torchrl.tasks.base import Box, Task
+from phihp_torchrl.tasks.base import Task
+from phihp_torchrl.tasks.box import Box
 from phihp_torchrl.tasks.registry import register_task
 
 POSITION_LIMIT = 2.4
-"""Farthest the cart may be from the middle, in m."""
+"""Largest distance of the cart from the middle, in m."""
 ANGLE_LIMIT = radians(12.0)
-"""Farthest the pole may lean, in rad."""
+"""Largest angle of the pole from upright, in rad."""
 
 _SYSTEM = CartPole()
 _HALF_LENGTH = _SYSTEM.constants["half_length"]
@@ -34,8 +38,9 @@ def fallen(next_state: Tensor) -> Tensor:
 def approach_reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
     """-|tip - (0, 1)|² of the pole's tip (x + 2l sin theta, 2l cos theta), after the step.
 
-    The logarithm of :func:`tip_reward`, which is flat, near 0, wherever the pole hangs: a short
-    plan sees nothing there, and data collected for it never show the pole upright.
+    This is the logarithm of :func:`tip_reward`, which is almost constant, near 0, wherever the pole
+    hangs: a short plan for that reward does not move the pole, and the data that it collects never
+    contain the upright pole.
     """
     x, _, theta, _ = next_state.unbind(-1)
     tip_x = x + 2 * _HALF_LENGTH * theta.sin()
@@ -51,7 +56,7 @@ def tip_reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
 def published_tip_reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
     """exp(-(x + l sin theta)² - (l cos theta)²), after the step: what the published runs maximise.
 
-    It lacks the goal's height, so a pole lying flat scores best and hanging still 389 of 500.
+    It leaves out the height of the goal: a horizontal pole earns most, a hanging one 389 of 500.
     """
     x, _, theta, _ = next_state.unbind(-1)
     center_x = x + _HALF_LENGTH * theta.sin()
@@ -74,7 +79,6 @@ register_task(
         reward=alive_reward,
         terminated=fallen,
         coverage=Box.around((0.0,) * 4, (POSITION_LIMIT, 3.0, ANGLE_LIMIT, 3.0)),
-        env_id="phihp/CartPole-v0",
     )
 )
 register_task(
@@ -89,7 +93,6 @@ register_task(
         coverage=_SWINGUP_COVERAGE,
         goal=Box.around((0.0,) * 4, (0.5, 1.0, 0.5, 1.5)),
         exploration_reward=approach_reward,
-        env_id="phihp/CartPoleSwingup-v0",
     )
 )
 register_task(
@@ -102,6 +105,5 @@ register_task(
         reset=_HANGING,
         reward=published_tip_reward,
         coverage=_SWINGUP_COVERAGE,
-        env_id="phihp/CartPoleSwingupPublished-v0",
     )
 )

@@ -1,4 +1,4 @@
-"""Pendulum and PendulumSwingup (SPEC section 1)."""
+"""Pendulum and PendulumSwingup (paper, appendix B; docs/tasks.md)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from math import pi
 from torch import Tensor
 
 from phihp_torchrl.systems import Pendulum, wrap
-from phihp_torchrl.tasks.base import Box, Task
+from phihp_torchrl.tasks.base import Task
+from phihp_torchrl.tasks.box import Box
 from phihp_torchrl.tasks.registry import register_task
 
 
@@ -30,7 +31,6 @@ register_task(
         reset=Box.around((0.0, 0.0), (pi, 1.0)),
         reward=upright_reward,
         coverage=_COVERAGE,
-        env_id="phihp/Pendulum-v0",
     )
 )
 register_task(
@@ -43,6 +43,5 @@ register_task(
         reset=Box.around((pi, 0.0), (pi / 32, 1.0)),
         reward=upright_reward,
         coverage=_COVERAGE,
-        env_id="phihp/PendulumSwingup-v0",
     )
 )

@@ -1,4 +1,4 @@
-"""The world of any task as a gymnasium environment, stepped by the task's own functions."""
+"""The simulated world of any task as a gymnasium environment."""
 
 from __future__ import annotations
 
@@ -11,19 +11,22 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from phihp_torchrl.integrators import Integrator, make_integrator
-from phihp_torchrl.tasks import Task, get_task
+from phihp_torchrl.tasks import Task, find_task
+from phihp_torchrl.worlds.simulated.plant import Plant, find_plant
 
 
 class TaskEnv(gym.Env[Any, Any]):
-    """The real world of a task; a subclass adds rendering by inheriting it from gymnasium.
+    """The simulated world of a task as a gymnasium environment.
 
-    Observations are ``task.system.observe(state)`` in float32, actions are in physical units and
-    clipped to their bounds, the arithmetic is in float64. Episodes end where the task says so;
-    ``task.max_steps`` is gymnasium's ``TimeLimit``, applied by ``gymnasium.make``.
+    Observations are ``task.observe(state)`` in float32, actions are in physical units and
+    clipped to their bounds, the arithmetic is in float64. Episodes end where the task terminates
+    them; ``gymnasium.make`` applies ``task.max_steps`` by a ``TimeLimit``. Subclasses for the
+    paper's systems inherit rendering from gymnasium's environments.
 
     Args:
         task: a :class:`~phihp_torchrl.tasks.Task` or the name of a registered one.
-        integrator: how the world integrates, by name; defaults to the task's own integrator.
+        integrator: name of the integrator, or an instance. Defaults to semi-implicit Euler.
+        plant: true constants and friction. Defaults to the plant registered for the task's system.
         render_mode: one of ``metadata["render_modes"]``, or ``None``.
 
     Raises:
@@ -31,7 +34,7 @@ class TaskEnv(gym.Env[Any, Any]):
             and on setting :attr:`state`, for a wrong shape, a wrong dtype or non-finite values.
 
     Examples:
-        >>> from phihp_torchrl.envs import TaskEnv
+        >>> from phihp_torchrl.worlds import TaskEnv
         >>> env = TaskEnv("cartpole", integrator="rk4")
         >>> observation, info = env.reset(options={"state": [0.0, 0.0, 0.1, 0.0]})
         >>> observation.shape, env.state.dtype
@@ -43,11 +46,13 @@ class TaskEnv(gym.Env[Any, Any]):
         task: str | Task,
         *,
         integrator: str | Integrator | None = None,
+        plant: Plant | None = None,
         render_mode: str | None = None,
     ) -> None:
         super().__init__()  # in a subclass: what gymnasium's environment needs for drawing
-        self.task = get_task(task) if isinstance(task, str) else task
-        self.integrator = make_integrator(integrator or self.task.integrator)
+        self.task = find_task(task)
+        self.plant = plant or find_plant(self.task.system)
+        self.integrator = make_integrator(integrator or "semi_implicit_euler")
         modes = [None, *self.metadata["render_modes"]]
         if render_mode not in modes:
             raise ValueError(f"render_mode: expected one of {modes}, got {render_mode!r}.")
@@ -60,7 +65,7 @@ class TaskEnv(gym.Env[Any, Any]):
 
     @property
     def state(self) -> NDArray[np.float64] | None:
-        """The physical state ``[n]`` in SPEC's order; ``None`` before the first reset."""
+        """The physical state ``[n]``, in the system's order; ``None`` before the first reset."""
         return self._state
 
     @state.setter
@@ -90,30 +95,32 @@ class TaskEnv(gym.Env[Any, Any]):
         """Hold ``action`` ``[m]`` for one time step; ``truncated`` is left to ``TimeLimit``."""
         if self._state is None:
             raise ResetNeeded("state: expected a call of reset() before step().")
-        held = torch.from_numpy(self._checked_action(action))
+        wanted = torch.from_numpy(self._checked_action(action))
         with torch.inference_mode():
-            held = self.task.clip_action(held)
             state = torch.from_numpy(self._state)
-            next_state = self.task.step(state, held, self.integrator)
-            reward = float(self.task.reward(state, held, next_state))
-            terminated = bool(self.task.is_terminated(next_state))
+            next_state, reward, terminated = self.task.transition(self._move, state, wanted)
             observation = self._observe(next_state)
         self.state = next_state.numpy()
-        self.last_action = held.numpy()
         if self.render_mode == "human":
             self.render()
-        return observation, reward, terminated, False, {}
+        return observation, float(reward), bool(terminated), False, {}
+
+    def _move(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        self.last_action = action.numpy()
+        return self.integrator(
+            lambda s: self.plant.derivative(s, action), state, self.task.time_step, self.task.layout
+        )
 
     def _observe(self, state: torch.Tensor) -> NDArray[np.float32]:
-        return cast(NDArray[np.float32], self.task.system.observe(state).float().numpy())
+        return cast(NDArray[np.float32], self.task.observe(state).float().numpy())
 
     def _checked_state(self, value: ArrayLike) -> NDArray[np.float64]:
         names = self.task.system.state_names
         return _checked("state", value, len(names), f"finite values for {names}")
 
     def _checked_action(self, value: ArrayLike) -> NDArray[np.float64]:
-        high = self.task.action_high
-        return _checked("action", value, len(high), f"finite values, bounds ±{high}")
+        low, high = self.task.action_low, self.task.action_high
+        return _checked("action", value, len(high), f"finite values, bounds {low} to {high}")
 
 
 def _checked(what: str, value: ArrayLike, size: int, expected: str) -> NDArray[np.float64]:
@@ -128,15 +135,16 @@ def _checked(what: str, value: ArrayLike, size: int, expected: str) -> NDArray[n
 
 
 def _action_space(task: Task) -> gym.spaces.Box:
-    high = np.array(task.action_high, dtype=np.float32)
-    return gym.spaces.Box(-high, high, dtype=np.float32)
+    low, high = (np.array(limit, dtype=np.float32) for limit in (task.action_low, task.action_high))
+    return gym.spaces.Box(low, high, dtype=np.float32)
 
 
 def _observation_space(task: Task) -> gym.spaces.Box:
-    """Cosines and sines within ±1, limited velocities within their limit, all else unbounded."""
+    """Cosines and sines within ±1, limited velocities within their limits, all else unbounded."""
     limits = {v: limit for (_, v), limit in zip(task.layout.pairs, task.layout.limits, strict=True)}
-    high: list[float] = []
+    bounds: list[tuple[float, float]] = []
     for i in range(task.system.state_dim):
-        high += [1.0, 1.0] if i in task.system.angle_indices else [limits.get(i, np.inf)]
-    bound = np.array(high, dtype=np.float32)
-    return gym.spaces.Box(-bound, bound, dtype=np.float32)
+        free = limits.get(i, (-np.inf, np.inf))
+        bounds += [(-1.0, 1.0)] * 2 if i in task.system.angle_indices else [free]
+    low, high = np.array(bounds, dtype=np.float32).T
+    return gym.spaces.Box(low, high, dtype=np.float32)

@@ -1,22 +1,31 @@
-"""Where imagined episodes start: the strongest lever on how fast the policy learns."""
+"""Start states of imagined episodes, which affect the speed of learning more than all else."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from phihp_torchrl.config import ConfigError, check_not_negative
 from phihp_torchrl.tasks import Box, Task
 
 
 class StartStates(Protocol):
-    """Anything that draws states to start from.
+    """The interface of everything that draws start states of imagined episodes.
 
-    Draws are made on the generator's own device (the CPU if there is none) and then moved, so a
-    seed gives the same states on every device.
+    The states are drawn on the device of the generator (the CPU if there is none) and then moved,
+    so a seed gives the same states on every device.
+
+    Examples:
+        >>> class Zeros:
+        ...     def sample(self, shape, generator=None, device=None):
+        ...         return torch.zeros(*shape, 2, device=device)
+        >>> MixtureStates({Zeros(): 1.0}).sample([3]).abs().max()
+        tensor(0.)
     """
 
     def sample(
@@ -25,14 +34,14 @@ class StartStates(Protocol):
         generator: torch.Generator | None = None,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Draw states ``[*shape, n]``, float32."""
+        """Draw states ``[*shape, n]``, float32, on ``device``."""
 
 
 class BoxStates:
-    """States drawn uniformly from a box.
+    """Start states drawn uniformly from a box.
 
     Args:
-        box: the box.
+        box: the box of states.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -54,10 +63,10 @@ class BoxStates:
 
 
 class DataStates:
-    """States drawn with replacement from those seen in real data.
+    """Start states drawn with replacement from the states of real data.
 
     Args:
-        states: states ``[N, n]``; :meth:`update` replaces them as the data grows.
+        states: states ``[N, n]``; :meth:`update` replaces them when the data grow.
 
     Raises:
         ValueError: if there are no states, or some are not finite.
@@ -95,13 +104,13 @@ class DataStates:
 
 
 class MixtureStates:
-    """Each state from one of several samplers, chosen at random by weight.
+    """Start states drawn from several samplers, one of which is chosen at random for each state.
 
     Args:
-        weights: samplers and their weights, in any unit; they are normalised.
+        weights: samplers and their weights; the weights are divided by their sum.
 
     Raises:
-        ValueError: for a weight that is negative or not finite, or if none is positive.
+        ConfigError: for a weight that is negative or not finite, or if none is positive.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -116,7 +125,7 @@ class MixtureStates:
             _check_weight(type(sampler).__name__, weight)
         positive = {sampler: weight for sampler, weight in weights.items() if weight > 0}
         if not positive:
-            raise ValueError(f"weights: expected some above 0, got {list(weights.values())}.")
+            raise ConfigError("weights", f"expected some above 0, got {list(weights.values())}.")
         total = sum(positive.values())
         self.samplers = tuple(positive)
         self.weights = tuple(weight / total for weight in positive.values())
@@ -127,8 +136,8 @@ class MixtureStates:
         generator: torch.Generator | None = None,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        # Every component draws every row: cheaper than sorting the rows out, and what a row
-        # receives does not depend on the choices of the others.
+        # Every sampler draws every row: that is cheaper than to group the rows by sampler, and a
+        # row then does not depend on the choices of other rows.
         draws = torch.stack([s.sample(shape, generator, device) for s in self.samplers])
         uniform = torch.rand([*shape, 1], generator=generator, device=_draw_device(generator))
         edges = torch.tensor(self.weights[:-1], device=uniform.device).cumsum(0)
@@ -136,58 +145,80 @@ class MixtureStates:
         return draws.gather(0, choice.expand(draws.shape[1:]).unsqueeze(0)).squeeze(0)
 
 
-def make_start_states(
-    task: Task,
-    *,
-    reset: float = 0.2,
-    data: float = 0.0,
-    coverage: float = 0.6,
-    goal: float = 0.2,
-    states: Tensor | DataStates | None = None,
-) -> MixtureStates:
-    """Mix the places that a task knows; a box that the task lacks leaves its share to the others.
+@dataclass(frozen=True)
+class StartConfig:
+    """Where imagined episodes start: the shares of four kinds of start states.
+
+    The shares are divided by their sum.
 
     Args:
-        task: the task.
-        reset: share of the states from the task's own resets.
-        data: share of the states seen in real data.
-        coverage: share of the states from the wide box.
-        goal: share of the states near the goal.
-        states: the real data, ``[N, n]``, or a :class:`DataStates` that its owner keeps up to date.
+        reset: share that starts in the task's reset box, as real episodes do.
+        data: share that starts in states of the real data.
+        coverage: share that starts anywhere in the task's coverage box.
+        goal: share that starts in the box around the task's goal, if it has one.
 
     Raises:
-        ValueError: for a share that is negative or not finite, for shares of which none is left,
-            and for ``data`` without ``states``; the message names the key.
+        ConfigError: for a share that is negative or not finite.
+
+    Examples:
+        >>> StartConfig(goal=-0.5)
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: goal: expected a number >= 0, got -0.5.
+    """
+
+    reset: float = 0.2
+    data: float = 0.0
+    coverage: float = 0.6
+    goal: float = 0.2
+
+    def __post_init__(self) -> None:
+        check_not_negative(self, "reset", "data", "coverage", "goal")
+
+
+def make_start_states(
+    task: Task, shares: StartConfig | None = None, states: Tensor | DataStates | None = None
+) -> MixtureStates:
+    """Make the start states of a task by shares; a box that the task lacks gets no share.
+
+    Args:
+        task: the task, with its boxes.
+        shares: the share of each kind of start states. Defaults to ``StartConfig()``.
+        states: states of real data, ``[N, n]``, or a :class:`DataStates` that is updated elsewhere.
+
+    Raises:
+        ConfigError: if no share is positive, and for ``data`` > 0 without ``states``.
 
     Examples:
         >>> from phihp_torchrl import get_task
-        >>> start_states = make_start_states(get_task("pendulum"), reset=0.5, coverage=0.5)
+        >>> start_states = make_start_states(get_task("pendulum"), StartConfig(reset=0.6))
         >>> start_states.weights  # this task has no goal box
         (0.5, 0.5)
     """
-    shares = {"reset": reset, "data": data, "coverage": coverage, "goal": goal}
-    for name, share in shares.items():
-        _check_weight(name, share)
-    if data > 0 and states is None:
-        raise ValueError(f"data: expected states to draw from with data={data}, got states=None.")
+    shares = shares or StartConfig()
+    if shares.data > 0 and states is None:
+        raise ConfigError(
+            "data", f"expected states to draw from with data={shares.data}, got none."
+        )
     boxes = {"reset": task.reset, "coverage": task.coverage, "goal": task.goal}
     samplers: dict[str, StartStates] = {
         k: BoxStates(box) for k, box in boxes.items() if box is not None
     }
     if states is not None:
         samplers["data"] = states if isinstance(states, DataStates) else DataStates(states)
-    present = {name: shares[name] for name in samplers}
+    present = {name: getattr(shares, name) for name in samplers}
     if not any(present.values()):
-        raise ValueError(
-            f"{', '.join(shares)}: expected a share above 0 for one of {sorted(present)}, "
-            f"which is all that task {task.name!r} has; got {shares}."
+        raise ConfigError(
+            "start",
+            f"expected a share above 0 for one of {sorted(present)}, which is all that task "
+            f"{task.name!r} has; got {shares}.",
         )
     return MixtureStates({samplers[name]: share for name, share in present.items()})
 
 
 def _check_weight(name: str, weight: float) -> None:
     if not (math.isfinite(weight) and weight >= 0):
-        raise ValueError(f"{name}: expected a finite weight of at least 0, got {weight}.")
+        raise ConfigError(name, f"expected a finite weight of at least 0, got {weight}.")
 
 
 def _draw_device(generator: torch.Generator | None) -> torch.device:

@@ -1,4 +1,4 @@
-"""Imagination: a task's world model as a TorchRL environment, of any batch size."""
+"""A task's world model as a TorchRL environment of any batch size."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ from torchrl.envs.model_based import ModelBasedEnvBase
 from torchrl.envs.model_based import WorldModelEnv as StockWorldModelEnv
 
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.envs.start_states import BoxStates, StartStates
+from phihp_torchrl.imagination.start_states import BoxStates, StartStates
 
 
 class WorldModelEnv(StockWorldModelEnv):
-    """Steps a :class:`~phihp_torchrl.dynamics.TaskWorldModel` as if it were the world.
+    """A TorchRL environment that steps a :class:`~phihp_torchrl.dynamics.TaskWorldModel`.
 
-    Besides ``"observation"`` a tensordict carries ``"state"``, the model's latent: it goes along
-    through steps, resets and auto-resets, and where it is missing it is found from the observation.
-    An episode ends only where the task ends it; append a :class:`~torchrl.envs.StepCounter` to
-    truncate it. Gradients flow through a rollout unless the caller forbids them, as TorchRL's
-    collectors do.
+    Besides ``"observation"`` a tensordict has ``"state"``, the state of the model, which is kept in
+    steps, resets and auto-resets. If it is missing, it is computed from the observation. An episode
+    ends only where the task terminates it; append a :class:`~torchrl.envs.StepCounter` to truncate
+    it. Gradients flow through a rollout unless the caller disables them, as TorchRL's collectors
+    do.
 
-    With ``batch_size=()`` tensordicts of any batch shape are accepted, which planners need. With
-    another one the env holds that many worlds, and is locked to them.
+    With ``batch_size=()`` it accepts tensordicts of any batch shape, which planners need. With
+    another batch size it holds that many worlds and accepts only that shape.
 
     ``reset(tensordict)`` starts from the ``"state"`` or else from the ``"observation"`` given,
     unless ``set_state=False`` or a ``"_reset"`` mask asks for fresh states. Wrapped in a
     :class:`~torchrl.envs.TransformedEnv`, ask with ``set_state=True``, as TorchRL prescribes.
 
-    It mends :class:`torchrl.envs.model_based.WorldModelEnv` (specs of batches, latents lost at
-    auto-resets, termination) for models of a known task. Other
-    :class:`~torchrl.modules.WorldModel` instances know neither their specs nor where to start, and
-    want a :class:`~torchrl.envs.ModelBasedEnvBase` of their own.
+    For models of a known task it corrects :class:`torchrl.envs.model_based.WorldModelEnv`, whose
+    specs lack the batch size, whose auto-resets lose the latent state, and which has no
+    termination. Other :class:`~torchrl.modules.WorldModel` instances have neither specs nor start
+    states; subclass :class:`~torchrl.envs.ModelBasedEnvBase` for them.
 
     Args:
-        world_model: the task's model; later changes of its parameters are seen at once.
-        start_states: where episodes start. Defaults to the task's resets.
+        world_model: the task's model; later changes of its parameters take effect at once.
+        start_states: start states of episodes. Defaults to the task's reset box.
         batch_size: number of worlds, in any shape.
-        device: device of the model and of all data. Defaults to the model's own.
-        seed: seed of the resets. Defaults to a draw from torch's global generator.
+        device: device of the model and of all data. Defaults to the device of the model.
+        seed: seed of the resets. Defaults to a number from torch's global generator.
 
     Raises:
-        TypeError: for a world model that is not a task's.
+        TypeError: for a world model that is not a :class:`TaskWorldModel`.
         ValueError: from ``reset`` and ``step``, for an action, observation or state of the wrong
             shape, dtype or device, and for a start that is not finite; the message names the key.
 
@@ -83,7 +83,7 @@ class WorldModelEnv(StockWorldModelEnv):
         )
         self._world_model = world_model.to(self.device)
         self.latent_key = "state"
-        # The base class leaves every env unlocked, but then drops rows from a batch of its own.
+        # The base class unlocks every env, which then drops rows of a batch that has a size.
         self._batch_locked = len(self.batch_size) > 0
         self.start_states = (
             BoxStates(world_model.task.reset) if start_states is None else start_states
@@ -104,18 +104,17 @@ class WorldModelEnv(StockWorldModelEnv):
             return Unbounded(shape=(*batch, size), device=device)
 
         def situation() -> Composite:
-            system = task.system
             return Composite(
-                observation=vector(system.observation_dim),
-                state=vector(system.state_dim),
+                observation=vector(task.observation_dim),
+                state=vector(task.state_dim),
                 shape=batch,
                 device=device,
             )
 
         self.observation_spec = situation()
-        self.state_spec = situation()  # what a step or a reset may start from
-        high = torch.tensor(task.action_high, device=device).expand(*batch, -1)
-        self.action_spec = Bounded(low=-high, high=high)
+        self.state_spec = situation()  # the keys from which a step or a reset may start
+        low, high = (limit.to(device).expand(*batch, -1) for limit in task.bounds[:2])
+        self.action_spec = Bounded(low=low, high=high)
         self.reward_spec = vector(1)
         self.done_spec = Binary(shape=(*batch, 1), device=device, dtype=torch.bool)
 
@@ -125,9 +124,9 @@ class WorldModelEnv(StockWorldModelEnv):
         self.generator.manual_seed(seed)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        batch, system = tensordict.batch_size, self.tensor_model.task.system
+        batch, task = tensordict.batch_size, self.tensor_model.task
         state = self._find_state(tensordict)
-        action = self._checked("action", tensordict.get("action", None), batch, system.action_dim)
+        action = self._checked("action", tensordict.get("action", None), batch, task.action_dim)
         next_state, reward, terminated = self.tensor_model.transition(state, action)
         return self._result(next_state, terminated).set("reward", reward.unsqueeze(-1))
 
@@ -141,11 +140,11 @@ class WorldModelEnv(StockWorldModelEnv):
         else:
             batch = self.batch_size if tensordict is None else tensordict.batch_size
             state = self.start_states.sample(batch, self.generator, self.device)
-            self._checked("start_states", state, batch, self.tensor_model.task.system.state_dim)
+            self._checked("start_states", state, batch, self.tensor_model.task.state_dim)
         return self._result(state, torch.zeros_like(state[..., 0], dtype=torch.bool))
 
     def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
-        # Rows under a mask are over: what the tensordict says of them is from before.
+        # A mask selects rows whose episode has ended, so their state in the tensordict is old.
         if tensordict is None or "_reset" in tensordict:
             return False
         return super()._input_td_has_state(tensordict)
@@ -153,7 +152,7 @@ class WorldModelEnv(StockWorldModelEnv):
     def _resolve_set_state(
         self, set_state: bool | None, tensordict: TensorDictBase | None, select_reset_only: bool
     ) -> bool | None:
-        # A given start counts without a word, here as in the stock class and in later TorchRL too.
+        # A state in the tensordict is used without set_state=True, as in the stock class.
         if set_state is None and not select_reset_only:
             set_state = self._input_td_has_state(tensordict)
         return super()._resolve_set_state(set_state, tensordict, select_reset_only)
@@ -172,13 +171,13 @@ class WorldModelEnv(StockWorldModelEnv):
         )
 
     def _find_state(self, tensordict: TensorDictBase) -> Tensor:
-        batch, system = tensordict.batch_size, self.tensor_model.task.system
+        batch, task = tensordict.batch_size, self.tensor_model.task
         state = tensordict.get("state", None)
         if state is not None:
-            return self._checked("state", state, batch, system.state_dim)
+            return self._checked("state", state, batch, task.state_dim)
         observation = tensordict.get("observation", None)
         return self.tensor_model.locate(
-            self._checked("observation", observation, batch, system.observation_dim)
+            self._checked("observation", observation, batch, task.observation_dim)
         )
 
     def _checked(self, key: str, value: Tensor | None, batch: torch.Size, size: int) -> Tensor:

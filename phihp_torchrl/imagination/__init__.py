@@ -1,0 +1,36 @@
+"""Imagination: start states, rollouts of a policy in a model, and the model as an environment."""
+
+from __future__ import annotations
+
+from phihp_torchrl.imagination.rollouts import (
+    ChunkNoise,
+    Policy,
+    Returns,
+    Rollouts,
+    Worlds,
+    draw_noise,
+    step_worlds,
+    sum_rewards,
+)
+from phihp_torchrl.imagination.start_states import (
+    BoxStates,
+    DataStates,
+    MixtureStates,
+    StartConfig,
+    StartStates,
+    make_start_states,
+)
+from phihp_torchrl.imagination.transitions import Batch, Transit, finite_transition
+from phihp_torchrl.imagination.world_model_env import WorldModelEnv
+
+__all__ = [
+    "Batch",
+    "BoxStates",
+    "DataStates",
+    "MixtureStates",
+    "Rollouts",
+    "StartConfig",
+    "StartStates",
+    "WorldModelEnv",
+    "make_start_states",
+]

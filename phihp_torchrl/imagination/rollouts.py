@@ -1,0 +1,216 @@
+"""Rollouts of a policy in many worlds at once: transitions and returns, each as one graph."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.imagination.transitions import Batch, finite_transition
+from phihp_torchrl.tasks import ActionBounds
+
+_logger = logging.getLogger(__name__)
+
+Policy = Callable[[Sequence[Tensor], Tensor, ActionBounds], Tensor]
+"""A policy as a function: weights, observations ``[N, o]`` and bounds to actions ``[N, m]``."""
+
+
+class Worlds(NamedTuple):
+    """The states and ages of many worlds."""
+
+    state: Tensor
+    """Current states, ``[worlds, n]``."""
+    age: Tensor
+    """Steps since the last reset, int64 ``[worlds]``."""
+
+
+class ChunkNoise(NamedTuple):
+    """All random numbers of a chunk, drawn outside the compiled graph so that seeds reproduce."""
+
+    start_states: Tensor
+    """The state from which a world continues if its episode ends there, ``[steps, worlds, n]``."""
+    exploration: Tensor
+    """Noise on the policy's action, in units of the action's half-range, ``[steps, worlds, m]``."""
+    random_actions: Tensor
+    """Uniform actions in physical units, ``[steps, worlds, m]``."""
+    use_random: Tensor
+    """Whether the random action replaces the policy's, bool ``[steps, worlds]``."""
+
+
+def draw_noise(
+    start_states: Tensor,
+    bounds: ActionBounds,
+    *,
+    std: float,
+    random_fraction: float,
+    generator: torch.Generator | None = None,
+) -> ChunkNoise:
+    """Draw the noise of a chunk of ``start_states`` ``[steps, worlds, n]``.
+
+    Args:
+        start_states: reset states, one for each step and world.
+        bounds: bounds of the action.
+        std: standard deviation of the noise, in units of the action's half-range.
+        random_fraction: share of uniformly random actions, in [0, 1].
+        generator: source of randomness.
+    """
+    shape = start_states.shape[:-1]
+    options: dict[str, Any] = {"generator": generator, "device": start_states.device}
+    exploration = std * torch.randn([*shape, bounds.scale.shape[0]], **options)
+    uniform = 2.0 * torch.rand([*shape, bounds.scale.shape[0]], **options) - 1.0
+    use_random = torch.rand(shape, **options) < random_fraction
+    return ChunkNoise(start_states, exploration, bounds.from_unit(uniform), use_random)
+
+
+def step_worlds(
+    world_model: TaskWorldModel,
+    policy: Policy,
+    weights: Sequence[Tensor],
+    worlds: Worlds,
+    noise: ChunkNoise,
+    bounds: ActionBounds,
+    max_age: int,
+) -> tuple[Batch, Worlds]:
+    """Step all worlds through a chunk under the policy with exploration noise.
+
+    A world whose episode terminates, becomes non-finite or reaches ``max_age`` steps continues from
+    a new start state. Reaching ``max_age`` is a truncation and is not recorded as ``terminated``. A
+    transition to a non-finite state is recorded as a termination without a change of the state.
+
+    Args:
+        world_model: the model in which the worlds move.
+        policy: the policy.
+        weights: weights of the policy.
+        worlds: states and ages of the worlds.
+        noise: random numbers of the chunk.
+        bounds: bounds of the action.
+        max_age: largest number of steps in an episode.
+
+    Returns:
+        The transitions, ``[steps * worlds]`` rows, and the new states and ages of the worlds.
+    """
+    state, age = worlds
+    rows: list[Batch] = []
+    for t in range(noise.use_random.shape[0]):
+        action = policy(weights, world_model.observe(state), bounds)
+        action = bounds.clip(action + noise.exploration[t] * bounds.scale)
+        action = torch.where(noise.use_random[t].unsqueeze(-1), noise.random_actions[t], action)
+        next_state, reward, terminated = finite_transition(world_model.transition, state, action)
+        rows.append(Batch(state, action, reward, next_state, terminated))
+        age = age + 1
+        ended = terminated | (age >= max_age)
+        state = torch.where(ended.unsqueeze(-1), noise.start_states[t], next_state)
+        age = torch.where(ended, torch.zeros_like(age), age)
+    batch = Batch(*(torch.cat(column) for column in zip(*rows, strict=True)))
+    return batch, Worlds(state, age)
+
+
+class Returns(NamedTuple):
+    """Episodes and the sums of their rewards so far."""
+
+    state: Tensor
+    """Current states, ``[N, n]``."""
+    total: Tensor
+    """Discounted rewards so far, ``[N]``."""
+    weight: Tensor
+    """Weight of the next reward: gamma^k after k steps, 0 after a termination; ``[N]``."""
+
+    @classmethod
+    def from_state(cls, state: Tensor) -> Returns:
+        """Make episodes that start in ``state`` ``[N, n]``."""
+        return cls(state, torch.zeros_like(state[..., 0]), torch.ones_like(state[..., 0]))
+
+
+def sum_rewards(
+    world_model: TaskWorldModel,
+    policy: Policy,
+    weights: Sequence[Tensor],
+    returns: Returns,
+    bounds: ActionBounds,
+    steps: int,
+    gamma: float = 1.0,
+) -> Returns:
+    """Continue episodes for ``steps`` steps of the noise-free policy, and add their rewards."""
+    state, total, weight = returns
+    for _ in range(steps):
+        action = policy(weights, world_model.observe(state), bounds)
+        state, reward, terminated = world_model.transition(state, action)
+        total = total + weight * reward
+        weight = gamma * weight * (1.0 - terminated.to(weight.dtype))
+    return Returns(state, total, weight)
+
+
+class Rollouts:
+    """Rolls out a policy in a world model, learned or simulated, for transitions and for returns.
+
+    Args:
+        world_model: the model in which the policy acts; later changes of its parameters take effect
+            at once.
+        policy: the policy as a function of its weights, such as
+            :func:`phihp_torchrl.agents.act`.
+        max_age: largest number of steps in an episode.
+        device: device of the states. Defaults to the CPU.
+        compile: whether to compile (10 to 40 s the first time, from the cache afterwards). If the
+            integrator of the model does not compile, a warning is logged and nothing is compiled.
+
+    Examples:
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> from phihp_torchrl.agents import Actor, act
+        >>> task = get_task("pendulum")
+        >>> model = TaskWorldModel(task, HybridDynamics.hybrid(task))
+        >>> rollouts = Rollouts(model, act, max_age=200)
+        >>> weights = [layer.detach() for layer in Actor(task).mlp.parameters()]
+        >>> rollouts.returns(weights, task.reset.sample([3]), steps=200).total.shape
+        torch.Size([3])
+    """
+
+    # Steps of a compiled piece of a return: enough that its call is cheap, few enough to compile.
+    _RETURN_STEPS = 5
+
+    def __init__(
+        self,
+        world_model: TaskWorldModel,
+        policy: Policy,
+        max_age: int,
+        *,
+        device: torch.device | str = "cpu",
+        compile: bool = False,
+    ) -> None:
+        if compile and not world_model.compiles:
+            _logger.warning("Rollouts are not compiled: the model's integrator does not compile.")
+            compile = False
+        self.bounds = world_model.task.bounds.to(device)
+        self.max_age = max_age
+        self._step_worlds = compile_graph(
+            partial(step_worlds, world_model, policy), enabled=compile
+        )
+        self._sum_rewards = partial(sum_rewards, world_model, policy)
+        self._sum_rewards_chunk = compile_graph(self._sum_rewards, enabled=compile)
+
+    def chunk(
+        self, weights: Sequence[Tensor], worlds: Worlds, noise: ChunkNoise
+    ) -> tuple[Batch, Worlds]:
+        """Step all worlds through a chunk: :func:`step_worlds`."""
+        return self._step_worlds(weights, worlds, noise, self.bounds, self.max_age)
+
+    def returns(
+        self, weights: Sequence[Tensor], state: Tensor, steps: int, gamma: float = 1.0
+    ) -> Returns:
+        """Sum the rewards of ``steps`` steps of the noise-free policy from each state ``[N, n]``.
+
+        Args:
+            weights: weights of the policy.
+            state: first states, ``[N, n]``.
+            steps: number of steps.
+            gamma: discount.
+        """
+        returns, size = Returns.from_state(state), self._RETURN_STEPS
+        for _ in range(steps // size):
+            returns = self._sum_rewards_chunk(weights, returns, self.bounds, size, gamma)
+        return self._sum_rewards(weights, returns, self.bounds, steps % size, gamma)

@@ -1,0 +1,60 @@
+"""Bounds of an action, and the unit in which noise on it is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class ActionBounds(NamedTuple):
+    """Bounds of an action with their middle and half-range, ``[m]`` each, in physical units.
+
+    Networks read and write actions in units of the half-range around the middle, so that bounds may
+    be asymmetric, such as -6 to 12 V or 0 to 100 %.
+
+    Args:
+        low: lower bounds.
+        high: upper bounds.
+        center: the middle; zero where there is no bound.
+        scale: the half-range; one where there is no bound.
+
+    Examples:
+        >>> bounds = ActionBounds.from_limits(torch.tensor([0.0]), torch.tensor([100.0]))
+        >>> bounds.to_unit(torch.tensor([75.0])), bounds.clip(torch.tensor([120.0]))
+        (tensor([0.5000]), tensor([100.]))
+    """
+
+    low: Tensor
+    high: Tensor
+    center: Tensor
+    scale: Tensor
+
+    @classmethod
+    def from_limits(
+        cls, low: Tensor | Sequence[float], high: Tensor | Sequence[float]
+    ) -> ActionBounds:
+        """Bounds ``[m]`` with their middle and half-range; limits may be infinite."""
+        low, high = torch.as_tensor(low), torch.as_tensor(high)
+        half = high / 2 - low / 2
+        bounded = half.isfinite()
+        center = torch.where(bounded, low / 2 + high / 2, torch.zeros_like(half))
+        return cls(low, high, center, torch.where(bounded, half, torch.ones_like(half)))
+
+    def clip(self, action: Tensor) -> Tensor:
+        """Clip an action ``[*batch, m]``."""
+        return action.clamp(self.low, self.high)
+
+    def to_unit(self, action: Tensor) -> Tensor:
+        """An action ``[*batch, m]`` in units of the half-range: the bounds become -1 and 1."""
+        return (action - self.center) / self.scale
+
+    def from_unit(self, action: Tensor) -> Tensor:
+        """The inverse of :meth:`to_unit`."""
+        return self.center + self.scale * action
+
+    def to(self, device: torch.device | str) -> ActionBounds:
+        """Return the same bounds on another device."""
+        return ActionBounds(*(part.to(device) for part in self))

@@ -1,0 +1,43 @@
+"""Worlds, the source of real steps: simulated, gymnasium's, or any TorchRL environment."""
+
+from __future__ import annotations
+
+from phihp_torchrl.worlds.agreement import disagreements
+from phihp_torchrl.worlds.base import World
+from phihp_torchrl.worlds.gymnasium import GymnasiumConfig, GymnasiumWorld
+from phihp_torchrl.worlds.registry import (
+    WORLDS,
+    GivenConfig,
+    WorldKind,
+    make_world,
+    register_world,
+)
+from phihp_torchrl.worlds.simulated import (
+    Plant,
+    PlantPhysics,
+    SimulatedConfig,
+    SimulatedWorld,
+    TaskEnv,
+    find_plant,
+    make_limited_env,
+    make_task_env,
+    register_env,
+    register_plant,
+)
+from phihp_torchrl.worlds.torchrl import EnvWorld, TorchRLConfig, import_object
+
+__all__ = [
+    "EnvWorld",
+    "GymnasiumConfig",
+    "GymnasiumWorld",
+    "Plant",
+    "SimulatedConfig",
+    "SimulatedWorld",
+    "TaskEnv",
+    "TorchRLConfig",
+    "World",
+    "make_world",
+    "register_env",
+    "register_plant",
+    "register_world",
+]

@@ -1,0 +1,158 @@
+"""The registered kinds of worlds, and the function that makes a world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields
+from typing import Any, ClassVar
+
+import gymnasium
+from torchrl.envs import EnvBase, GymWrapper
+
+from phihp_torchrl.config import ConfigError, Registry, offer, read_kind
+from phihp_torchrl.tasks import Task, find_task
+from phihp_torchrl.worlds.base import World
+from phihp_torchrl.worlds.gymnasium import GymnasiumConfig, GymnasiumWorld
+from phihp_torchrl.worlds.simulated import SimulatedConfig, SimulatedWorld
+from phihp_torchrl.worlds.torchrl import EnvWorld, TorchRLConfig
+
+
+@dataclass(frozen=True)
+class WorldKind:
+    """A registered kind of world.
+
+    Args:
+        config: dataclass of its settings.
+        build: ``(task, config) -> world``.
+        about: description in one line.
+    """
+
+    config: type[Any]
+    build: Callable[[Task, Any], World]
+    about: str = ""
+
+
+WORLDS: Registry[WorldKind] = Registry("world")
+"""Registered kinds of worlds by name; the first is the default."""
+
+
+def register_world(
+    name: str,
+    config: type[Any],
+    build: Callable[[Task, Any], World],
+    *,
+    about: str = "",
+    replace: bool = False,
+) -> WorldKind:
+    """Register a kind of world, for ``world=name world.setting=...`` in settings.
+
+    Args:
+        name: the name.
+        config: dataclass of its settings, with a class attribute ``kind`` that equals ``name``.
+        build: ``(task, config) -> world``.
+        about: description in one line.
+        replace: whether a kind of that name may be replaced.
+
+    Returns:
+        The registered kind.
+
+    Raises:
+        ConfigError: if the name is taken and ``replace`` is false.
+
+    Examples:
+        >>> kind = register_world("simulated", SimulatedConfig, SimulatedWorld, replace=True)
+        >>> type(make_world("pendulum", "simulated")).__name__
+        'SimulatedWorld'
+    """
+    kind = WORLDS.register(name, WorldKind(config, build, about), replace=replace)
+    # A field without a default must be given, which Hydra's ??? enforces.
+    node = {f.name: _default(f) for f in fields(config) if f.init}
+    offer("world", name, {"world": {"kind": name, **node}})
+    return kind
+
+
+def make_world(task: str | Task, world: Any = "simulated") -> World:
+    """Make the world that ``world`` describes, for ``task``.
+
+    Args:
+        task: a task, or the name of a registered one.
+        world: the name of a kind of world, a mapping of its settings with their ``kind``, a
+            dataclass of its settings, a TorchRL or gymnasium environment, a function that makes
+            one, or a :class:`World`.
+
+    Raises:
+        ConfigError: for a kind that is not registered, or settings that it does not have.
+
+    Examples:
+        >>> str(make_world("pendulum", {"kind": "gymnasium", "id": "Pendulum-v1"}))
+        'gymnasium Pendulum-v1'
+        >>> import gymnasium, phihp_torchrl
+        >>> make_world("acrobot", gymnasium.make("phihp/Acrobot-v0")).kind
+        'torchrl'
+    """
+    task = find_task(task)
+    if isinstance(world, World):
+        return world
+    if isinstance(world, str):
+        WORLDS.find(world)
+        world = {"kind": world}
+    if isinstance(world, Mapping):
+        world = read_kind(WORLDS, world, "world")
+    if isinstance(world, gymnasium.Env):
+        world = GymWrapper(world)
+    kind = getattr(type(world), "kind", "")
+    if kind in WORLDS and isinstance(world, WORLDS[kind].config):
+        return WORLDS[kind].build(task, world)
+    if isinstance(world, EnvBase) or callable(world):
+        return EnvWorld(task, world, label=getattr(world, "__name__", type(world).__name__))
+    raise ConfigError(
+        "world",
+        f"expected one of {sorted(WORLDS)}, settings, an environment or a function that makes one, "
+        f"got {world!r}.",
+    )
+
+
+@dataclass(frozen=True)
+class GivenConfig:
+    """Settings of a world that was passed from Python, and cannot be made from settings."""
+
+    kind: ClassVar[str] = "given"
+
+
+def _refuse(task: Task, config: GivenConfig) -> World:
+    raise ConfigError(
+        "world.kind",
+        "this run was started from Python with a world of its own; pass that world again.",
+    )
+
+
+def _default(f: Any) -> Any:
+    if f.default is not MISSING:
+        return f.default
+    return f.default_factory() if f.default_factory is not MISSING else "???"
+
+
+register_world(
+    SimulatedConfig.kind,
+    SimulatedConfig,
+    SimulatedWorld,
+    about="the task's own equations with true constants and friction",
+)
+register_world(
+    GymnasiumConfig.kind,
+    GymnasiumConfig,
+    GymnasiumWorld,
+    about="a gymnasium id: world=gymnasium world.id=Pendulum-v1",
+)
+register_world(
+    TorchRLConfig.kind,
+    TorchRLConfig,
+    EnvWorld.from_config,
+    about="any TorchRL environment: world=torchrl world.make=module:function",
+)
+register_world(
+    GivenConfig.kind,
+    GivenConfig,
+    _refuse,
+    about="an environment that learn(task, world) was given in Python",
+)

@@ -1,0 +1,141 @@
+"""Simulated worlds, whose equations are known and which can be stepped in any batch shape."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import gymnasium
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torchrl.envs import Compose, EnvBase, GymWrapper, RewardSum, StepCounter, TransformedEnv
+
+from phihp_torchrl.config import ConfigError, check_choice, check_count
+from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
+from phihp_torchrl.imagination import WorldModelEnv
+from phihp_torchrl.integrators import INTEGRATORS, FixedStepIntegrator, Integrator, make_integrator
+from phihp_torchrl.tasks import Task, find_task
+from phihp_torchrl.worlds.base import World
+from phihp_torchrl.worlds.simulated.plant import Plant, PlantPhysics, find_plant
+
+
+@dataclass(frozen=True)
+class SimulatedConfig:
+    """Settings of a :class:`SimulatedWorld`.
+
+    Args:
+        integrator: integrator of the world, semi_implicit_euler, rk4 or dopri5.
+        substeps: solver steps in a control step; 1 for dopri5, which chooses its steps.
+        constants: true constants that differ from the system's first guesses, by name.
+        friction: friction coefficients that differ from the plant's defaults, by name.
+
+    Raises:
+        ConfigError: for an unknown integrator or a number of substeps that is not positive.
+
+    Examples:
+        >>> world = SimulatedWorld("cartpole", SimulatedConfig(friction={"cart": 0.0}))
+        >>> world.truth.coefficients
+        {'cart': 0.0, 'pole': 0.02}
+    """
+
+    kind: ClassVar[str] = "simulated"
+
+    integrator: str = "semi_implicit_euler"
+    substeps: int = 1
+    constants: Mapping[str, float] = field(default_factory=dict, hash=False)
+    friction: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        check_choice(self, "integrator", INTEGRATORS)
+        check_count(self, "substeps")
+        if self.substeps > 1 and not issubclass(INTEGRATORS[self.integrator], FixedStepIntegrator):
+            raise ConfigError("substeps", f"expected 1 for {self.integrator}, got {self.substeps}.")
+
+
+class SimulatedWorld(World):
+    """A world simulated by the plant of the task's system: F^p with true constants, and friction.
+
+    Args:
+        task: a task or the name of a registered one.
+        config: integrator, constants and friction. Defaults to ``SimulatedConfig()``.
+
+    Raises:
+        ConfigError: for unknown constants or coefficients, or a system that cannot be simulated.
+
+    Examples:
+        >>> world = SimulatedWorld("cartpole")
+        >>> env = world.make_batch([8], seed=0)
+        >>> env.rollout(20, break_when_any_done=False)["next", "episode_reward"].shape
+        torch.Size([8, 20, 1])
+        >>> world.truth.constants["cart_mass"]
+        1.0
+    """
+
+    kind = SimulatedConfig.kind
+
+    def __init__(self, task: str | Task, config: SimulatedConfig | None = None) -> None:
+        super().__init__(find_task(task))
+        self.config = config = config or SimulatedConfig()
+        try:
+            self._plant = find_plant(self.task.system, config.constants, config.friction)
+        except ConfigError as error:
+            key = error.key.replace("coefficients", "friction", 1)  # as the settings call them
+            raise ConfigError(f"world.{key}", error.reason) from error
+        settings = {"substeps": config.substeps} if config.substeps > 1 else {}
+        self.integrator: Integrator = make_integrator(config.integrator, **settings)
+
+    @property
+    def truth(self) -> Plant:
+        """The plant, with the true constants and friction."""
+        return self._plant
+
+    def oracle(self) -> HybridDynamics:
+        """Return the world as dynamics without parameters, with friction and integrator."""
+        physics = PlantPhysics(self._plant)
+        return HybridDynamics(self.task, prior=physics, residual=None, integrator=self.integrator)
+
+    def model(self) -> TaskWorldModel:
+        """Return the world as an exact model, of any batch shape."""
+        return TaskWorldModel(self.task, self.oracle())
+
+    def step(self, state: Tensor, action: Tensor) -> Tensor:
+        """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
+        return self.oracle()(state, action)
+
+    def make_env(self, *, render: bool = False) -> EnvBase:
+        env = gymnasium.make(
+            "phihp/Task-v0",
+            task=self.task,
+            plant=self._plant,
+            integrator=self.integrator,
+            render_mode="rgb_array" if render else None,
+        )
+        return TransformedEnv(GymWrapper(env), StepCounter())
+
+    def picture(self, env: EnvBase) -> NDArray[Any] | None:
+        return env.base_env._env.render()
+
+    def make_batch(
+        self,
+        batch_size: Sequence[int],
+        *,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+    ) -> TransformedEnv:
+        """Make one TorchRL environment that simulates many worlds at once.
+
+        Episodes are truncated after ``task.max_steps``. The environment also writes
+        ``"step_count"`` and ``"episode_reward"``.
+
+        Args:
+            batch_size: number of worlds, in any shape.
+            seed: seed of the resets.
+            device: device of the data. Defaults to the CPU.
+
+        Returns:
+            The environment, in float32.
+        """
+        env = WorldModelEnv(self.model(), batch_size=batch_size, device=device, seed=seed)
+        return TransformedEnv(env, Compose(StepCounter(max_steps=self.task.max_steps), RewardSum()))
