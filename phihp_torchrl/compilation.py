@@ -1,9 +1,9 @@
-"""How the hot paths are compiled: one full graph each, its matrix products by oneDNN.
+"""Compilation of the time-critical functions: one full graph each, matrix products by oneDNN.
 
 On a CPU, ATen hands products of float32 matrices to its BLAS. At most of the sizes met here, 64 to
 thousands of rows through layers of 200 to 300 units, oneDNN is faster on processors for which that
-BLAS has no AVX-512 kernels (``make bench`` has the ratio to ``torch.mm``); ATen itself asks it for
-reduced precision alone. So the compiler is told to ask for it.
+BLAS has no AVX-512 kernels (``make bench`` prints the ratio to ``torch.mm``). ATen uses oneDNN for
+reduced precision only, so the compiler is told here to use it for float32 as well.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _aten = torch.ops.aten
-# Multiplications below which oneDNN's call costs more than its kernel saves: 32 rows through a
-# layer of 300 units are faster by the BLAS, 64 by oneDNN.
+# Products of fewer multiplications stay with the BLAS, because calling oneDNN costs more than its
+# kernel saves: 32 rows through a layer of 300 units are faster by the BLAS, 64 by oneDNN.
 _FEWEST = 2**22
 
 torch.library.define(
@@ -44,23 +44,25 @@ def _linear(input: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> T
 def compile_graph(
     function: Callable[P, R], *, enabled: bool = True, cpp_wrapper: bool = False, **options: Any
 ) -> Callable[P, R]:
-    """Compile a pure function of tensors as one graph, which fails where it would break.
+    """Compile a pure function of tensors as one graph; a graph break raises an error.
 
-    Shapes are static: each combination is a graph of its own. The first call with one compiles it,
-    10 to 40 s, or 1 to 3 s from the compiler's cache on disk. Each compiled function has its own
-    budget of graphs, so any number of agents may compile the same function in a process.
+    Shapes are static: each combination of shapes has a separate graph, which is compiled at the
+    first call with these shapes. That takes 10 to 40 s, or 1 to 3 s from the compiler's cache on
+    disk. The number of graphs is limited for each compiled function and not for all of them
+    together, so any number of agents may compile the same function in a process.
 
-    Whether a graph still fits is asked of the arguments at each call, and of the modules' modes of
-    training, but not of all else that the function closes over: to look through hundreds of
-    attributes takes a good part of a small plan's time.
+    Each call compares the arguments and the training modes of modules with those that the graph
+    was compiled for. It does not compare everything else that the function closes over, because
+    checking hundreds of attributes takes a good part of a small plan's time.
 
     Args:
-        function: what to compile. What it closes over is a constant of the graph, except tensors
-            changed in place and modules' modes: compile again after other changes.
-        enabled: ``False`` leaves the function as it is.
-        cpp_wrapper: call the kernels from C++ in place of Python. Compiling takes longer, a call of
-            many small kernels less time.
-        options: for :func:`torch.compile`, beside and over ours.
+        function: the function to compile. Whatever it closes over is a constant of the graph,
+            except tensors that are changed in place and training modes of modules; compile again
+            after other changes.
+        enabled: ``False`` returns the function unchanged.
+        cpp_wrapper: whether to call the kernels from C++ instead of Python. Compilation takes
+            longer, a call of many small kernels less time.
+        options: options of :func:`torch.compile`; they override those that are set here.
 
     Examples:
         >>> double = compile_graph(lambda x: 2 * x, backend="eager")
@@ -73,7 +75,7 @@ def compile_graph(
     def graph(*args: P.args, **kwargs: P.kwargs) -> R:
         return function(*args, **kwargs)
 
-    # Dynamo counts its graphs by code object, and all closures made here would share one.
+    # Dynamo counts graphs per code object, which all closures made here would otherwise share.
     graph.__code__ = graph.__code__.replace()
     if "mode" not in options:  # the compiler takes a mode or options
         ours: dict[str, Any] = {"guard_filter_fn": _guards_to_keep}
@@ -87,7 +89,7 @@ def compile_graph(
 
 
 def _guards_to_keep(guards: Sequence[Any]) -> list[bool]:
-    """Those of arguments and of the state of torch, which have no name, and modes of modules."""
+    """Keep the guards on arguments and torch's state, which have no name, and on training modes."""
     return [
         guard.name.endswith(".training")
         or not (guard.is_global or guard.name.startswith("function"))  # as `graph` names it
@@ -96,7 +98,7 @@ def _guards_to_keep(guards: Sequence[Any]) -> list[bool]:
 
 
 class _MatricesByOneDNN(CustomGraphPass):
-    """Replaces the larger products of matrices on the CPU, with what is added and a ReLU after."""
+    """Replaces the larger matrix products on the CPU, with their bias and a ReLU that follows."""
 
     def __call__(self, graph: fx.Graph) -> None:
         node: Any
@@ -107,7 +109,7 @@ class _MatricesByOneDNN(CustomGraphPass):
             with graph.inserting_before(node):
                 users = list(node.users)
                 if not added and users and all(map(_is_transposition, users)):
-                    # A gradient of weights, better made the way round in which it is used.
+                    # The gradient of a weight, computed in the transposed form in which it is used.
                     product = _insert_linear(graph, _transposed(graph, b), a)
                 else:
                     relu = len(users) == 1 and users[0].target is _aten.relu.default
@@ -131,13 +133,20 @@ def _is_eligible(node: Any) -> bool:
     rows, inner, columns = a.shape[0], a.shape[1], b.shape[1]
     return (
         a.device.type == "cpu"
-        and a.dtype in (torch.float32, torch.bfloat16)
+        and a.dtype in _dtypes()
         and all(isinstance(size, int) for size in (rows, inner, columns))
         and columns > 1
         and rows * inner * columns >= _FEWEST
         and all(bias.shape == (columns,) for bias in added)
         and all(node.kwargs.get(name, 1) == 1 for name in ("alpha", "beta"))
     )
+
+
+def _dtypes() -> tuple[torch.dtype, ...]:
+    """What oneDNN multiplies here: on processors without AVX-512 it has no bfloat16."""
+    if torch.ops.mkldnn._is_mkldnn_bf16_supported():
+        return torch.float32, torch.bfloat16
+    return (torch.float32,)
 
 
 def _is_transposition(node: Any) -> bool:

@@ -1,16 +1,8 @@
-"""Actor and critics, and how TD3 trains them in imagination."""
+"""Actor and critics as modules, and TD3, which trains them (paper, section 4.2)."""
 
 from __future__ import annotations
 
-from phihp_torchrl.agents.functional import Batch
-from phihp_torchrl.agents.imagination import (
-    ChunkNoise,
-    Imagination,
-    Worlds,
-    draw_noise,
-    imagine,
-    imagined_return,
-)
+from phihp_torchrl.agents.equations import Layers, act, q_values, soft_update_
 from phihp_torchrl.agents.networks import (
     Actor,
     QNetwork,
@@ -23,35 +15,16 @@ from phihp_torchrl.agents.networks import (
 )
 from phihp_torchrl.agents.refit import CriticRefit, Refit, RefitConfig
 from phihp_torchrl.agents.replay import FlatReplay
-from phihp_torchrl.agents.stock import StockTD3Update
-from phihp_torchrl.agents.td3 import (
-    TD3Config,
-    TD3Update,
-    learning_rate_scale,
-    make_td3_loss,
-)
+from phihp_torchrl.agents.td3 import TD3Config, TD3Update, learning_rate_scale, make_td3_loss
 
 __all__ = [
     "Actor",
-    "Batch",
-    "ChunkNoise",
-    "CriticRefit",
-    "FlatReplay",
-    "Imagination",
     "QNetwork",
-    "Refit",
     "RefitConfig",
-    "StockTD3Update",
     "TD3Config",
     "TD3Update",
     "TwinQ",
-    "Worlds",
-    "copy_actor",
-    "copy_twin_qvalue",
-    "draw_noise",
-    "imagine",
-    "imagined_return",
-    "learning_rate_scale",
+    "act",
     "make_actor",
     "make_qvalue",
     "make_td3_loss",

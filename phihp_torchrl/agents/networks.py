@@ -1,91 +1,155 @@
-"""Actor and critics as modules (SPEC section 3)."""
+"""Actor and critics as modules (paper, section 4.2 and its table of hyper-parameters)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from phihp_torchrl.agents.functional import Layers, q_values
-from phihp_torchrl.tasks import Task
+from phihp_torchrl.agents.equations import Layers, q_values
+from phihp_torchrl.config import ConfigError, check_widths
+from phihp_torchrl.tasks import ActionBounds, Task
+
+N = TypeVar("N", bound="_Network")
 
 
-class Actor(nn.Module):
-    """A deterministic policy: observation ``[*batch, o]`` -> physical action ``[*batch, m]``.
+class _Network(nn.Module):
+    """The base of actor and critics: sizes, bounds of the action, and their description.
 
-    Args:
-        task: gives the sizes and the action bounds.
-        hidden_sizes: widths of the hidden layers (paper: 2 x 300, ReLU).
-        last_layer_scale: factor on the last layer's initial weights. A small one starts the policy
-            near zero torque, away from the flat ends of tanh.
+    The bounds are buffers that are not saved with the weights, because the task defines them.
     """
 
-    action_high: Tensor
+    kind: ClassVar[str]
+    low: Tensor
+    high: Tensor
+    center: Tensor
+    scale: Tensor
+
+    def __init__(self, task: Task, hidden_sizes: Sequence[int]) -> None:
+        super().__init__()
+        self.hidden_sizes = tuple(hidden_sizes)
+        check_widths(self, "hidden_sizes")
+        for name, limit in task.bounds._asdict().items():
+            self.register_buffer(name, limit, persistent=False)
+
+    @property
+    def bounds(self) -> ActionBounds:
+        """The bounds of the action, on the device of the network."""
+        return ActionBounds(self.low, self.high, self.center, self.scale)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Plain values from which :meth:`from_config` builds it again, without the weights."""
+        return {"kind": self.kind, "hidden_sizes": list(self.hidden_sizes)}
+
+    @classmethod
+    def from_config(cls: type[N], task: Task, config: Mapping[str, Any]) -> N:
+        """Build an untrained network from :attr:`config`.
+
+        Raises:
+            ConfigError: for a config of another kind of network.
+        """
+        if config["kind"] != cls.kind:
+            raise ConfigError("kind", f"expected {cls.kind!r}, got {config['kind']!r}.")
+        return cls(task, config["hidden_sizes"])
+
+
+class Actor(_Network):
+    """The actor, a deterministic policy: observation ``[*batch, o]`` to action ``[*batch, m]``.
+
+    Actions are in physical units and in bounds.
+
+    Args:
+        task: the task, which has the sizes and the bounds of the action.
+        hidden_sizes: widths of the hidden layers (paper: 2 x 300, ReLU).
+        last_layer_scale: factor on the initial weights of the last layer. With a small one the
+            first actions are near the middle of the bounds, where tanh is not saturated.
+
+    Raises:
+        ConfigError: for widths that are not positive whole numbers.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> Actor(get_task("acrobot-swingup"))(torch.zeros(5, 6)).shape
+        torch.Size([5, 2])
+    """
+
+    kind = "mlp_actor"
 
     def __init__(
         self, task: Task, hidden_sizes: Sequence[int] = (300, 300), last_layer_scale: float = 1.0
     ) -> None:
-        super().__init__()
+        super().__init__(task, hidden_sizes)
         self.mlp = MLP(
-            in_features=task.system.observation_dim,
-            out_features=task.system.action_dim,
+            in_features=task.observation_dim,
+            out_features=task.action_dim,
             num_cells=list(hidden_sizes),
             activation_class=nn.ReLU,
         )
         with torch.no_grad():
             self.mlp[-1].weight.mul_(last_layer_scale)
             self.mlp[-1].bias.mul_(last_layer_scale)
-        self.register_buffer("action_high", torch.tensor(task.action_high))
 
     def forward(self, observation: Tensor) -> Tensor:
-        return self.mlp(observation).tanh() * self.action_high
+        return self.bounds.from_unit(self.mlp(observation).tanh())
 
     @classmethod
     def from_layers(cls, task: Task, layers: Layers) -> Actor:
-        """An actor with copies of the layers ``(weight, bias, …)``, as TD3 trains them."""
+        """Build an actor with copies of the layers ``(weight, bias, …)`` that TD3 trains."""
         actor = cls(task, [weight.shape[0] for weight in layers[:-2:2]])
         _copy_layers(list(actor.mlp.parameters()), layers)
         return actor
 
 
-class QNetwork(nn.Module):
-    """One critic: observation, action in physical units -> value ``[*batch, 1]``.
+class QNetwork(_Network):
+    """One critic: observation ``[*batch, o]`` and action ``[*batch, m]`` to value ``[*batch, 1]``.
 
-    It sees the action scaled to [-1, 1].
+    Actions are in physical units; the network reads them scaled to [-1, 1].
 
     Args:
-        task: gives the sizes and the action bounds.
+        task: the task, which has the sizes and the bounds of the action.
         hidden_sizes: widths of the hidden layers (paper: 3 x 200, ReLU).
+
+    Raises:
+        ConfigError: for widths that are not positive whole numbers.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> QNetwork(get_task("pendulum"))(torch.zeros(5, 3), torch.zeros(5, 1)).shape
+        torch.Size([5, 1])
     """
 
-    action_high: Tensor
+    kind = "mlp_critic"
 
     def __init__(self, task: Task, hidden_sizes: Sequence[int] = (200, 200, 200)) -> None:
-        super().__init__()
+        super().__init__(task, hidden_sizes)
         self.mlp = MLP(
-            in_features=task.system.observation_dim + task.system.action_dim,
+            in_features=task.observation_dim + task.action_dim,
             out_features=1,
             num_cells=list(hidden_sizes),
             activation_class=nn.ReLU,
         )
-        self.register_buffer("action_high", torch.tensor(task.action_high))
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
-        return self.mlp(torch.cat([observation, action / self.action_high], -1))
+        return self.mlp(torch.cat([observation, self.bounds.to_unit(action)], -1))
 
 
-class TwinQ(nn.Module):
-    """Both critics at once: observation, action in physical units -> values ``[*batch, 2]``.
+class TwinQ(_Network):
+    """Both critics of TD3 in one module: observation and action to values ``[*batch, 2]``.
 
-    The layers are stacked ``[2, out, in]``, as :class:`torchrl.objectives.TD3Loss` stacks those of
-    two :class:`QNetwork`, and evaluated by :func:`~phihp_torchrl.agents.functional.q_values`.
+    Actions are in physical units. The layers are stacked ``[2, out, in]``, as
+    :class:`torchrl.objectives.TD3Loss` stacks those of two :class:`QNetwork`.
 
     Args:
-        task: gives the sizes and the action bounds.
+        task: the task, which has the sizes and the bounds of the action.
         hidden_sizes: widths of the hidden layers of each critic (paper: 3 x 200, ReLU).
+
+    Raises:
+        ConfigError: for widths that are not positive whole numbers.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -93,14 +157,13 @@ class TwinQ(nn.Module):
         torch.Size([5, 4, 2])
     """
 
-    action_high: Tensor
+    kind = "twin_q"
 
     def __init__(self, task: Task, hidden_sizes: Sequence[int] = (200, 200, 200)) -> None:
-        super().__init__()
+        super().__init__(task, hidden_sizes)
         critics = [QNetwork(task, hidden_sizes) for _ in range(2)]
         columns = zip(*(critic.mlp.parameters() for critic in critics), strict=True)
         self.layers = nn.ParameterList(torch.stack(column).detach() for column in columns)
-        self.register_buffer("action_high", torch.tensor(task.action_high))
 
     def forward(self, observation: Tensor, action: Tensor) -> Tensor:
         batch = observation.shape[:-1]
@@ -108,13 +171,13 @@ class TwinQ(nn.Module):
             list(self.layers),
             observation.reshape(-1, observation.shape[-1]),
             action.reshape(-1, action.shape[-1]),
-            self.action_high,
+            self.bounds,
         )
         return values.mT.reshape(*batch, -1)
 
     @classmethod
     def from_layers(cls, task: Task, layers: Layers) -> TwinQ:
-        """Critics with copies of the stacked layers ``(weight, bias, …)``, as TD3 trains them."""
+        """Build critics with copies of the stacked layers ``(weight, bias, …)`` that TD3 trains."""
         critics = cls(task, [weight.shape[1] for weight in layers[:-2:2]])
         _copy_layers(list(critics.layers), layers)
         return critics
@@ -134,32 +197,84 @@ def _copy_layers(params: Layers, layers: Layers) -> None:
 def make_actor(
     task: Task, hidden_sizes: Sequence[int] = (300, 300), last_layer_scale: float = 1.0
 ) -> TensorDictModule:
-    """The actor as a TensorDict module, ``"observation"`` -> ``"action"``."""
+    """Make an actor as a TensorDict module, which reads ``"observation"`` and writes ``"action"``.
+
+    Args:
+        task: the task, which has the sizes and the bounds of the action.
+        hidden_sizes: widths of the hidden layers.
+        last_layer_scale: factor on the initial weights of the last layer.
+
+    Raises:
+        ConfigError: for widths that are not positive whole numbers.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from phihp_torchrl import get_task
+        >>> actor = make_actor(get_task("pendulum"), hidden_sizes=(8,))
+        >>> actor(TensorDict(observation=torch.zeros(5, 3), batch_size=[5]))["action"].shape
+        torch.Size([5, 1])
+    """
     return TensorDictModule(
         Actor(task, hidden_sizes, last_layer_scale), ["observation"], ["action"]
     )
 
 
 def make_qvalue(task: Task, hidden_sizes: Sequence[int] = (200, 200, 200)) -> TensorDictModule:
-    """One critic as a TensorDict module, as :class:`torchrl.objectives.TD3Loss` takes it."""
+    """Make one critic as a TensorDict module, for :class:`torchrl.objectives.TD3Loss`.
+
+    Args:
+        task: the task, which has the sizes and the bounds of the action.
+        hidden_sizes: widths of the hidden layers.
+
+    Raises:
+        ConfigError: for widths that are not positive whole numbers.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from phihp_torchrl import get_task
+        >>> qvalue = make_qvalue(get_task("pendulum"), hidden_sizes=(8,))
+        >>> data = TensorDict(
+        ...     observation=torch.zeros(5, 3), action=torch.zeros(5, 1), batch_size=[5]
+        ... )
+        >>> qvalue(data)["state_action_value"].shape
+        torch.Size([5, 1])
+    """
     return TensorDictModule(
         QNetwork(task, hidden_sizes), ["observation", "action"], ["state_action_value"]
     )
 
 
 def make_twin_qvalue(task: Task, hidden_sizes: Sequence[int] = (200, 200, 200)) -> TensorDictModule:
-    """Both critics as a TensorDict module that writes ``[*batch, 2]``, as planners take it."""
+    """Make both critics as one TensorDict module that writes ``[*batch, 2]``, for planners.
+
+    Args:
+        task: the task, which has the sizes and the bounds of the action.
+        hidden_sizes: widths of the hidden layers of each critic.
+
+    Raises:
+        ConfigError: for widths that are not positive whole numbers.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from phihp_torchrl import get_task
+        >>> qvalue = make_twin_qvalue(get_task("pendulum"), hidden_sizes=(8,))
+        >>> data = TensorDict(
+        ...     observation=torch.zeros(5, 3), action=torch.zeros(5, 1), batch_size=[5]
+        ... )
+        >>> qvalue(data)["state_action_value"].shape
+        torch.Size([5, 2])
+    """
     return TensorDictModule(
         TwinQ(task, hidden_sizes), ["observation", "action"], ["state_action_value"]
     )
 
 
 def copy_actor(task: Task, layers: Layers) -> TensorDictModule:
-    """An actor with copies of the layers that TD3 trains, ``"observation"`` -> ``"action"``."""
+    """Make an actor with copies of the layers that TD3 trains, as :func:`make_actor` does."""
     return TensorDictModule(Actor.from_layers(task, layers), ["observation"], ["action"])
 
 
 def copy_twin_qvalue(task: Task, layers: Layers) -> TensorDictModule:
-    """Both critics with copies of the layers that TD3 trains, as planners take them."""
+    """Make critics with copies of the layers that TD3 trains, as :func:`make_twin_qvalue` does."""
     critics = TwinQ.from_layers(task, layers)
     return TensorDictModule(critics, ["observation", "action"], ["state_action_value"])

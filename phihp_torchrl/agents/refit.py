@@ -1,4 +1,4 @@
-"""Critics fitted to returns in the model, which TD3's own targets approach slowly."""
+"""Critics fitted to returns in the model, which TD3's temporal-difference targets lag behind."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from phihp_torchrl.agents.functional import (
+from phihp_torchrl.agents.equations import (
     Layers,
+    act,
     adam_,
     adam_rates,
     critic_loss,
-    finite_transition,
-    policy,
     q_values,
 )
-from phihp_torchrl.agents.imagination import Imagination
 from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.config import check_count, check_positive
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.ranges import check_not_negative, check_positive
+from phihp_torchrl.imagination import Rollouts, finite_transition
+from phihp_torchrl.tasks import ActionBounds
 
-# Half of the actions are near the actor's, where actor and planner compare values; the others are
-# those of the replay, so that the critics also know what not to do.
+# Half of the actions are near the actor's, where actor and planner compare values; the others come
+# from the replay buffer, so that the critics are accurate for other actions too.
 _OWN_SHARE = 0.5
 _OWN_NOISE = 0.1
-# Smallest mean of 1 - gamma^k by which a lag is told from the returns.
+# Smallest mean of 1 - gamma^k by which the lag is divided.
 _SMALLEST_WEIGHT = 1e-2
 
 
@@ -36,17 +36,26 @@ class RefitConfig:
     """When and how the critics are fitted to returns in the model.
 
     Args:
-        start: critic updates before the first fit; 0 for the one at the end alone.
-        interval: critic updates between two; 0 for none at all.
-        transitions: how many actions have their return imagined.
-        horizon: model steps of a return; the critics' own value comes after.
-        steps: steps of Adam, with cosine decay.
-        batch_size: transitions in a step.
-        learning_rate: of Adam at first.
+        start: critic updates before the critics are first fitted to returns in the model; 0 for
+            one fit at the end only.
+        interval: critic updates between two such fits; 0 for no fit.
+        transitions: number of actions whose returns are imagined.
+        horizon: model steps in a return, after which the value of the critics is added.
+        steps: steps of Adam in a fit, with cosine decay of the learning rate.
+        batch_size: returns in a step of Adam.
+        learning_rate: initial learning rate of Adam.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> config = RefitConfig(start=4000, interval=2000)
+        >>> [config.is_due(updates, total=9000) for updates in (2000, 4000, 5000, 6000, 9000)]
+        [False, True, False, True, True]
     """
 
-    start: int = 0
-    interval: int = 0
+    start: int = 4000
+    interval: int = 2000
     transitions: int = 16384
     horizon: int = 100
     steps: int = 1500
@@ -54,8 +63,9 @@ class RefitConfig:
     learning_rate: float = 1e-3
 
     def __post_init__(self) -> None:
-        check_positive(self, "transitions", "horizon", "steps", "batch_size", "learning_rate")
-        check_not_negative(self, "start", "interval")
+        check_count(self, "transitions", "horizon", "steps", "batch_size")
+        check_count(self, "start", "interval", least=0)
+        check_positive(self, "learning_rate")
 
     def is_due(self, updates: int, total: int) -> bool:
         """Whether the critics are fitted after ``updates`` of ``total`` updates."""
@@ -67,13 +77,13 @@ class RefitConfig:
 
 
 class Refit(NamedTuple):
-    """What fitting the critics gave.
+    """The result of fitting the critics to returns.
 
     Attributes:
         critics: the fitted layers.
-        lag: by how much the values were too low on average.
-        error_before: standard deviation of the values' error before, apart from the lag.
-        error_after: the same after.
+        lag: average difference by which the values were too low before the fit.
+        error_before: standard deviation of the error of the values before the fit, without the lag.
+        error_after: standard deviation of the error of the values after the fit.
     """
 
     critics: list[Tensor]
@@ -83,34 +93,36 @@ class Refit(NamedTuple):
 
 
 class CriticRefit:
-    r"""Policy evaluation by returns: the critics of an actor, fitted to what it earns in the model.
+    r"""Fits the critics of an actor to its returns in the model (policy evaluation).
 
     .. math::
         y = \sum_{i<k} \gamma^i r_i + \gamma^k (\bar Q(s_k, \pi(s_k)) + c)
 
-    The first action is given, the others are the actor's; :math:`\bar Q` is the mean of the critics
-    before the fit. A TD target passes on :math:`\gamma` of a value and the targets follow slowly,
-    so after a number of updates n the values as a whole still lack about
-    :math:`e^{-\tau (1 - \gamma) n}` of themselves. That is the lag c, the one constant for which
-    the critics agree with their returns on average; it takes no part in the fit. The model is the
-    agent's own, so no real step is spent, and both critics learn the same target, without the
-    minimum by which TD3 stays low.
+    The first action is given, the following ones are the actor's; :math:`\bar Q` is the mean of the
+    critics before the fit. Temporal-difference targets pass on the fraction :math:`\gamma` of a
+    value, and the target networks follow slowly, so after n updates all values are still too low by
+    a fraction of about :math:`e^{-\tau (1 - \gamma) n}`. The lag c is the constant that makes the
+    critics agree with the returns on average; it is computed once and not fitted. The returns are
+    imagined in the model, so no real step is spent. Both critics are fitted to the same target,
+    without the minimum over critics that makes TD3 underestimate.
+
+    This is not in the paper; see docs/imagination.md.
 
     Args:
         world_model: the model.
-        imagination: the same model, to imagine returns in.
-        config: how.
+        rollouts: rollouts of the actor in the same model, for the returns.
+        config: when and how the critics are fitted.
         gamma: discount.
         compile: whether to compile a step of the fit.
 
     Examples:
         >>> from phihp_torchrl import HybridDynamics, get_task
-        >>> from phihp_torchrl.agents.td3 import TD3Config, TD3Update, make_td3_loss
+        >>> from phihp_torchrl.agents import TD3Config, TD3Update, make_td3_loss
         >>> task = get_task("pendulum")
-        >>> model = TaskWorldModel(task, HybridDynamics.oracle(task))
+        >>> model = TaskWorldModel(task, HybridDynamics.hybrid(task))
         >>> update = TD3Update(make_td3_loss(model, TD3Config()), model, TD3Config())
-        >>> imagination = Imagination(model, torch.tensor(task.action_high), max_age=200)
-        >>> refit = CriticRefit(model, imagination, RefitConfig(transitions=64, steps=2), 0.99)
+        >>> rollouts = Rollouts(model, act, max_age=200)
+        >>> refit = CriticRefit(model, rollouts, RefitConfig(transitions=64, steps=2), 0.99)
         >>> state, action = task.coverage.sample([64]), torch.zeros(64, 1)
         >>> len(refit(update.actor, update.critics, state, action).critics)
         8
@@ -119,14 +131,14 @@ class CriticRefit:
     def __init__(
         self,
         world_model: TaskWorldModel,
-        imagination: Imagination,
+        rollouts: Rollouts,
         config: RefitConfig,
         gamma: float,
         *,
         compile: bool = False,
     ) -> None:
         self.world_model = world_model
-        self.imagination = imagination
+        self.rollouts = rollouts
         self.config = config
         self.gamma = gamma
         self._step = compile_graph(_step, enabled=compile)
@@ -144,39 +156,39 @@ class CriticRefit:
 
         Args:
             actor: layers of the actor.
-            critics: layers of the critics, which stay as they are.
-            state: where to evaluate, ``[N, n]``.
-            action: first actions ``[N, m]``; half of them give way to ones near the actor's.
+            critics: layers of the critics; they are not changed.
+            state: states in which the returns start, ``[N, n]``.
+            action: first actions ``[N, m]``; half of them are replaced by actions near the actor's.
             generator: source of randomness.
         """
-        high, observation = self.imagination.action_high, self.world_model.observe(state)
-        action = self._mix(policy(actor, observation, high), action, generator)
-        value = q_values(critics, observation, action, high).mean(0)
+        bounds, observation = self.rollouts.bounds, self.world_model.observe(state)
+        action = self._mix(act(actor, observation, bounds), action, generator)
+        value = q_values(critics, observation, action, bounds).mean(0)
         target, lag = self._targets(actor, critics, state, action, value)
         error_before = (value + lag - target).std().item()
         fitted = [layer.clone() for layer in critics]
         fitted[-1] += lag
         self._fit(fitted, observation, action, target, generator)
-        error = q_values(fitted, observation, action, high).mean(0) - target
+        error = q_values(fitted, observation, action, bounds).mean(0) - target
         return Refit(fitted, lag.item(), error_before, error.std().item())
 
     def _mix(self, own: Tensor, given: Tensor, generator: torch.Generator | None) -> Tensor:
-        high = self.imagination.action_high
-        noise = torch.randn(own.shape, generator=generator, device=high.device)
-        near = torch.minimum(torch.maximum(own + _OWN_NOISE * high * noise, -high), high)
-        draw = torch.rand(len(own), 1, generator=generator, device=high.device)
+        bounds = self.rollouts.bounds
+        noise = torch.randn(own.shape, generator=generator, device=own.device)
+        near = bounds.clip(own + _OWN_NOISE * bounds.scale * noise)
+        draw = torch.rand(len(own), 1, generator=generator, device=own.device)
         return torch.where(draw < _OWN_SHARE, near, given)
 
     def _targets(
         self, actor: Layers, critics: Layers, state: Tensor, action: Tensor, value: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """The returns ``[N]``, their lag added, and the lag; where one is not finite, ``value``."""
-        config, high, observe = self.config, self.imagination.action_high, self.world_model.observe
+        """Returns ``[N]`` with the lag added, and the lag; non-finite returns become ``value``."""
+        config, bounds, observe = self.config, self.rollouts.bounds, self.world_model.observe
         step = finite_transition(self.world_model.transition, state, action)
         state, reward, terminated = step
-        returns = self.imagination.returns(actor, state, config.horizon, self.gamma)
+        returns = self.rollouts.returns(actor, state, config.horizon, self.gamma)
         observation = observe(returns.state)
-        beyond = q_values(critics, observation, policy(actor, observation, high), high).mean(0)
+        beyond = q_values(critics, observation, act(actor, observation, bounds), bounds).mean(0)
         alive = self.gamma * (1.0 - terminated.to(reward.dtype))
         weight = alive * returns.weight
         target = reward + alive * returns.total + weight * beyond
@@ -193,17 +205,17 @@ class CriticRefit:
         target: Tensor,
         generator: torch.Generator | None,
     ) -> None:
-        config, high = self.config, self.imagination.action_high
+        config, bounds = self.config, self.rollouts.bounds
         means, squares = ([torch.zeros_like(layer) for layer in critics] for _ in range(2))
-        counts = torch.arange(1, config.steps + 1, dtype=torch.float64, device=high.device)
+        counts = torch.arange(1, config.steps + 1, dtype=torch.float64, device=target.device)
         for i in range(config.steps):
             decay = 0.5 * (1.0 + math.cos(math.pi * i / config.steps))
             rates = adam_rates(counts[i], decay * config.learning_rate)
             index = torch.randint(
-                len(target), (config.batch_size,), generator=generator, device=high.device
+                len(target), (config.batch_size,), generator=generator, device=target.device
             )
             batch = observation[index], action[index], target[index]
-            self._step(critics, means, squares, *batch, high, *rates)
+            self._step(critics, means, squares, *batch, bounds, *rates)
 
 
 def _step(
@@ -213,12 +225,12 @@ def _step(
     observation: Tensor,
     action: Tensor,
     target: Tensor,
-    action_high: Tensor,
+    bounds: ActionBounds,
     size: Tensor,
     root: Tensor,
 ) -> None:
-    """One step of Adam on the critics."""
+    """Take one step of Adam on the critics, in place."""
     gradients, _ = torch.func.grad_and_value(critic_loss)(
-        critics, observation, action, target, action_high
+        critics, observation, action, target, bounds
     )
     adam_(critics, gradients, means, squares, size, root)

@@ -1,21 +1,22 @@
-"""A replay buffer that is one flat tensor."""
+"""A replay buffer in one flat tensor."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
-from phihp_torchrl.agents.functional import Batch
+from phihp_torchrl.config import check_count
+from phihp_torchrl.imagination import Batch
 
 
 class FlatReplay(nn.Module):
-    """Uniform replay of transitions, one row of one tensor each.
+    """A replay buffer with uniform sampling, which keeps each transition as a row of one tensor.
 
-    Sampling is a single gather, where a dictionary of storages needs one per entry. The whole
-    buffer is module state, so checkpoints carry it.
+    Sampling is a single gather, whereas a dictionary of storages needs one for each entry. The
+    buffer is part of the module's state, so checkpoints contain it.
 
     Args:
-        capacity: number of transitions kept; the oldest make room.
+        capacity: number of transitions kept; new ones replace the oldest.
         state_dim: state components, ``n``.
         action_dim: action components, ``m``.
 
@@ -32,10 +33,8 @@ class FlatReplay(nn.Module):
 
     def __init__(self, capacity: int, state_dim: int, action_dim: int) -> None:
         super().__init__()
-        if capacity < 1:
-            raise ValueError(
-                f"capacity: expected a positive number of transitions, got {capacity}."
-            )
+        self.capacity = capacity
+        check_count(self, "capacity")
         self.sizes = (state_dim, action_dim, 1, state_dim, 1)
         self.register_buffer("rows", torch.zeros(capacity, sum(self.sizes)))
         self.register_buffer("cursor", torch.zeros((), dtype=torch.int64))
@@ -43,14 +42,14 @@ class FlatReplay(nn.Module):
 
     @property
     def written(self) -> int:
-        """Transitions ever added."""
+        """Number of transitions that were ever added."""
         return self._written
 
     def __len__(self) -> int:
         return min(self._written, self.rows.shape[0])
 
     def extend(self, batch: Batch) -> None:
-        """Add transitions."""
+        """Add transitions, replacing the oldest if the buffer is full."""
         capacity, count = self.rows.shape[0], len(batch.reward)
         rows = torch.cat(
             [
@@ -70,7 +69,11 @@ class FlatReplay(nn.Module):
         self.cursor.fill_(self._written)
 
     def sample(self, batch_size: int, generator: torch.Generator | None = None) -> Batch:
-        """Draw ``batch_size`` transitions uniformly, with replacement."""
+        """Draw ``batch_size`` transitions uniformly, with replacement.
+
+        Raises:
+            RuntimeError: if the buffer is empty.
+        """
         if len(self) == 0:
             raise RuntimeError("sample: the replay buffer is empty; extend it first.")
         index = torch.randint(

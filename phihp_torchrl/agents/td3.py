@@ -1,4 +1,4 @@
-"""TD3 as one fused step on the tensors of TorchRL's TD3Loss."""
+"""TD3 as one compiled step on the tensors of TorchRL's TD3Loss (arXiv:1802.09477)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
-from phihp_torchrl.agents.functional import (
-    Batch,
+from phihp_torchrl.agents.equations import (
     Layers,
     actor_loss,
     adam_,
@@ -23,14 +22,22 @@ from phihp_torchrl.agents.functional import (
 )
 from phihp_torchrl.agents.networks import make_actor, make_qvalue
 from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.config import (
+    check_count,
+    check_not_negative,
+    check_positive,
+    check_positive_share,
+    check_widths,
+)
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.ranges import check_not_negative, check_positive, check_positive_share
+from phihp_torchrl.imagination import Batch
+from phihp_torchrl.tasks import ActionBounds
 
 _logger = logging.getLogger(__name__)
 
 
 class Networks(NamedTuple):
-    """All that a step changes: layers, each group ``[weight, bias, …]``."""
+    """The tensors that a step changes, each group a list ``[weight, bias, …]``."""
 
     actor: list[Tensor]
     critics: list[Tensor]
@@ -44,55 +51,92 @@ class Networks(NamedTuple):
 
 @dataclass(frozen=True)
 class TD3Config:
-    """Hyper-parameters of TD3 (SPEC section 3); the values are the published ones.
+    """Hyper-parameters of TD3 (paper, section 4.2; ``preset=paper`` has the published values).
 
-    Noise is in units of the action bounds.
+    Args:
+        actor_hidden_sizes: widths of the actor's hidden layers.
+        critic_hidden_sizes: widths of each critic's hidden layers.
+        actor_learning_rate: learning rate of the actor.
+        critic_learning_rate: learning rate of the critics.
+        last_layer_scale: factor on the initial weights of the actor's last layer.
+        gamma: discount γ.
+        tau: step τ of the target networks towards the networks, in each update of the actor.
+        policy_delay: critic updates for each update of the actor.
+        target_noise: std of the noise on target actions, in units of the action's half-range.
+        target_noise_clip: largest absolute value of that noise, in the same units.
+        value_expansion: number of rewards in the value target; the first is that of the transition,
+            the others come from the model (Acrobot needs 5).
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> TD3Config(gamma=1.5)
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: gamma: expected a number in (0, 1], got 1.5.
     """
 
     actor_hidden_sizes: tuple[int, ...] = (300, 300)
     critic_hidden_sizes: tuple[int, ...] = (200, 200, 200)
-    actor_learning_rate: float = 1e-3
-    critic_learning_rate: float = 1e-4
-    last_layer_scale: float = 1.0
+    actor_learning_rate: float = 3e-4
+    critic_learning_rate: float = 1e-3
+    last_layer_scale: float = 0.1
     gamma: float = 0.99
-    tau: float = 0.005
+    tau: float = 0.02
     policy_delay: int = 2
     target_noise: float = 0.1
     target_noise_clip: float = 0.5
     value_expansion: int = 1
 
     def __post_init__(self) -> None:
-        check_positive(
-            self, "actor_learning_rate", "critic_learning_rate", "policy_delay", "value_expansion"
-        )
+        check_widths(self, "actor_hidden_sizes", "critic_hidden_sizes")
+        check_positive(self, "actor_learning_rate", "critic_learning_rate")
+        check_count(self, "policy_delay", "value_expansion")
         check_positive_share(self, "gamma", "tau")
         check_not_negative(self, "target_noise", "target_noise_clip", "last_layer_scale")
 
 
 def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
-    """TorchRL's TD3Loss with the published networks and noise, for the world model's task."""
+    """Make TorchRL's TD3Loss with networks and noise by ``config``, for the world model's task.
+
+    Args:
+        world_model: the model; its task has the sizes and the bounds of the action.
+        config: hyper-parameters.
+
+    Returns:
+        A :class:`torchrl.objectives.TD3Loss` with two critics and target networks.
+
+    Examples:
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> task = get_task("pendulum")
+        >>> model = TaskWorldModel(task, HybridDynamics.hybrid(task))
+        >>> loss = make_td3_loss(model, TD3Config(actor_hidden_sizes=(8,)))
+        >>> [tuple(layer.shape) for layer in layers(loss.actor_network_params)]
+        [(8, 3), (8,), (1, 8), (1,)]
+    """
     task = world_model.task
-    high = torch.tensor(task.action_high)
+    bounds = task.bounds
     loss = TD3Loss(
         make_actor(task, config.actor_hidden_sizes, config.last_layer_scale),
         make_qvalue(task, config.critic_hidden_sizes),
-        bounds=(-high, high),
+        bounds=(bounds.low, bounds.high),
         num_qvalue_nets=2,
         loss_function="l2",
-        policy_noise=config.target_noise * high,
-        noise_clip=config.target_noise_clip * high,
+        policy_noise=config.target_noise * bounds.scale,
+        noise_clip=config.target_noise_clip * bounds.scale,
     )
     loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
-    SoftUpdate(loss, tau=config.tau)  # tells the loss that its targets are looked after
+    SoftUpdate(loss, tau=config.tau)  # marks the targets as updated, without which the loss warns
     return loss
 
 
 def learning_rate_scale(left: float, decay: float) -> float:
-    """A factor that stays 1, and falls with the end of a training to a twentieth.
+    """Return the factor on learning rates: 1 at first, falling to a twentieth at the end.
 
     Args:
-        left: share of the training that is left.
-        decay: over which share of it, at the end, the factor falls; 0 for never.
+        left: remaining share of the training, from 1 to 0.
+        decay: share of the training, at its end, in which the factor falls; 0 for never.
 
     Examples:
         >>> [learning_rate_scale(left, decay=0.5) for left in (0.9, 0.25, 0.0)]
@@ -102,23 +146,23 @@ def learning_rate_scale(left: float, decay: float) -> float:
 
 
 class TD3Update(nn.Module):
-    """``policy_delay`` critic updates, one actor update and the soft updates, as one graph.
+    """One step of TD3 as one graph: ``policy_delay`` critic updates, an actor update, soft updates.
 
-    The tensors it changes are those of a :class:`~torchrl.objectives.TD3Loss`, which stays the
-    owner of parameters and targets: checkpoints, planners and stock TorchRL code read them there.
-    The moments of Adam are buffers of this module.
+    The step changes the parameters and targets of a :class:`~torchrl.objectives.TD3Loss` in place,
+    so that checkpoints, planners and other TorchRL code can read them from the loss. The moments of
+    Adam are buffers of this module.
 
     Args:
-        loss: whose parameters to train.
-        world_model: maps states to observations and carries value expansion.
+        loss: the loss whose parameters are trained.
+        world_model: the model, which maps states to observations and computes value expansion.
         config: hyper-parameters.
-        compile: whether to compile the step (10 to 40 s at first, from the cache afterwards).
+        compile: whether to compile the step (10 to 40 s the first time, from the cache afterwards).
 
     Examples:
         >>> from phihp_torchrl import HybridDynamics, get_task
         >>> from phihp_torchrl.dynamics import TaskWorldModel
         >>> task = get_task("pendulum")
-        >>> model = TaskWorldModel(task, HybridDynamics.oracle(task))
+        >>> model = TaskWorldModel(task, HybridDynamics.hybrid(task))
         >>> config = TD3Config()
         >>> update = TD3Update(make_td3_loss(model, config), model, config)
         >>> state = task.coverage.sample([64])
@@ -144,6 +188,7 @@ class TD3Update(nn.Module):
         self.world_model = world_model
         self.config = config
         self._networks: Networks | None = None
+        self._bounds: ActionBounds | None = None
         for name, group in (("actor", self.actor), ("critics", self.critics)):
             for i, layer in enumerate(group):
                 self.register_buffer(f"{name}_mean_{i}", torch.zeros_like(layer))
@@ -156,17 +201,17 @@ class TD3Update(nn.Module):
 
     @property
     def actor(self) -> list[Tensor]:
-        """The actor's layers, the loss's own tensors."""
+        """The layers of the actor, which share memory with the loss."""
         return layers(self.loss.actor_network_params)
 
     @property
     def critics(self) -> list[Tensor]:
-        """The critics' stacked layers, the loss's own tensors."""
+        """The stacked layers of the critics, which share memory with the loss."""
         return layers(self.loss.qvalue_network_params)
 
     @property
     def networks(self) -> Networks:
-        """Layers, targets and moments, looked up once: there are more than fifty of them."""
+        """Layers, targets and moments; more than fifty tensors, so they are looked up once."""
         if self._networks is None:
             self._networks = Networks(
                 self.actor,
@@ -183,7 +228,7 @@ class TD3Update(nn.Module):
 
     @torch.no_grad()
     def restart(self, actor: Layers, critics: Layers) -> None:
-        """Go on from these layers, targets included; the moments of Adam stay as they are."""
+        """Continue from these layers, also as targets; the moments of Adam are not changed."""
         nets = self.networks
         for mine, given in (
             (nets.actor, actor),
@@ -195,11 +240,11 @@ class TD3Update(nn.Module):
                 layer.copy_(value)
 
     def _apply(self, *args: Any, **kwargs: Any) -> TD3Update:
-        self._networks = None  # they may move
+        self._networks = self._bounds = None  # the tensors may have moved to another device
         return super()._apply(*args, **kwargs)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_networks": None}  # a copy has its own
+        return {**self.__dict__, "_networks": None, "_bounds": None}  # not for a copy
 
     @torch.no_grad()
     def forward(
@@ -208,11 +253,11 @@ class TD3Update(nn.Module):
         learning_rate_scale: float = 1.0,
         generator: torch.Generator | None = None,
     ) -> dict[str, Tensor]:
-        """Train on ``policy_delay`` batches of equal size, given as one.
+        """Train on ``policy_delay`` batches of equal size, concatenated in ``batch``.
 
         Args:
-            batch: transitions, ``[policy_delay * N]`` rows: ``N`` for each critic update, of which
-                the last also serve the actor's.
+            batch: transitions, ``[policy_delay * N]`` rows: ``N`` for each critic update; the last
+                ``N`` are used for the actor update too.
             learning_rate_scale: factor on both learning rates.
             generator: source of the target policy's noise.
 
@@ -228,19 +273,21 @@ class TD3Update(nn.Module):
                 f"batch: expected a multiple of policy_delay = {config.policy_delay} rows, "
                 f"got {rows}."
             )
-        high = self.loss.max_action
-        noise = torch.randn(batch.action.shape, generator=generator, device=high.device)
+        if self._bounds is None:  # computed once, since that takes longer than to use them
+            self._bounds = ActionBounds.from_limits(self.loss.min_action, self.loss.max_action)
+        bounds = self._bounds
+        noise = torch.randn(batch.action.shape, generator=generator, device=bounds.low.device)
         clip = config.target_noise_clip
-        updates = torch.arange(1, config.policy_delay + 1, device=high.device)
+        updates = torch.arange(1, config.policy_delay + 1, device=bounds.low.device)
         loss_qvalue, loss_actor = self._compiled_step(
             batch,
-            (config.target_noise * noise).clamp(-clip, clip) * high,
+            (config.target_noise * noise).clamp(-clip, clip) * bounds.scale,
             adam_rates(self.steps + 1, learning_rate_scale * config.actor_learning_rate),
             adam_rates(
                 self.steps * config.policy_delay + updates,
                 learning_rate_scale * config.critic_learning_rate,
             ),
-            high,
+            bounds,
             self.networks,
         )
         self.steps += 1
@@ -252,17 +299,17 @@ class TD3Update(nn.Module):
         noise: Tensor,
         actor_rates: tuple[Tensor, Tensor],
         critic_rates: tuple[Tensor, Tensor],
-        high: Tensor,
+        bounds: ActionBounds,
         nets: Networks,
     ) -> tuple[Tensor, Tensor]:
         config, observe = self.config, self.world_model.observe
-        # The targets stand still until the soft update, so all batches share one pass for them.
+        # The targets do not change before the soft update, so one pass computes them for all rows.
         target = td3_target(
             batch,
             nets.target_actor,
             nets.target_critics,
             noise,
-            high,
+            bounds,
             config.gamma,
             observe,
             self.world_model.transition,
@@ -272,12 +319,12 @@ class TD3Update(nn.Module):
         for i, (state, action, value) in enumerate(zip(*parts, strict=True)):
             observation = observe(state)
             gradients, loss_qvalue = torch.func.grad_and_value(critic_loss)(
-                nets.critics, observation, action, value, high
+                nets.critics, observation, action, value, bounds
             )
             rates = (rate[i] for rate in critic_rates)
             adam_(nets.critics, gradients, nets.critic_means, nets.critic_squares, *rates)
         gradients, loss_actor = torch.func.grad_and_value(actor_loss)(
-            nets.actor, nets.critics, observation, high
+            nets.actor, nets.critics, observation, bounds
         )
         adam_(nets.actor, gradients, nets.actor_means, nets.actor_squares, *actor_rates)
         soft_update_(nets.target_actor, nets.actor, config.tau)
@@ -286,7 +333,7 @@ class TD3Update(nn.Module):
 
 
 def layers(params: TensorDictBase) -> list[Tensor]:
-    """The weights and biases of TD3Loss parameters, detached but the same memory."""
+    """Return weights and biases of parameters of TD3Loss, detached, sharing their memory."""
     mlp = params["module", "mlp"]
     names = sorted(mlp.keys(), key=int)
     return [mlp[name, part].detach() for name in names for part in ("weight", "bias")]

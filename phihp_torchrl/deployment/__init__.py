@@ -1,4 +1,4 @@
-"""Trained agents, whole: ready to act, to save and to load."""
+"""Trained agents: acting, saving, loading, exporting, and control in real time."""
 
 from __future__ import annotations
 
@@ -9,21 +9,19 @@ from phihp_torchrl.deployment.export import (
     export_onnx,
     largest_differences,
 )
-from phihp_torchrl.deployment.files import load_agent, save_agent
+from phihp_torchrl.deployment.files import AGENT_KINDS, load_agent, register_agent, save_agent
+from phihp_torchrl.deployment.formats import TaskSignature
 from phihp_torchrl.deployment.reading import AgentError
 from phihp_torchrl.deployment.realtime import RealTimeReport, run_realtime
-from phihp_torchrl.deployment.tdmpc import TDMPCAgent
 
 __all__ = [
     "Agent",
     "AgentError",
     "PlanModule",
-    "RealTimeReport",
-    "TDMPCAgent",
     "export_aoti",
     "export_onnx",
-    "largest_differences",
     "load_agent",
+    "register_agent",
     "run_realtime",
     "save_agent",
 ]

@@ -1,57 +1,70 @@
-"""A trained agent whole: model, actor, critics and planner behind one call."""
+"""A trained agent: model, actor, critics and planner in one module."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
-from phihp_torchrl.agents.networks import Actor, TwinQ
+from phihp_torchrl.agents import Actor, TwinQ
+from phihp_torchrl.config import ConfigError, kind_mapping, read_kind
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
-from phihp_torchrl.planners.factory import PlannerConfig, make_planner
+from phihp_torchrl.planners import PLANNERS, SamplingPlanner, SearchConfig, make_planner
 from phihp_torchrl.tasks import Task
 
 
 class Agent(TensorDictModuleBase):
-    """Observation in, action out: PhIHP's third phase (paper, section 4.3), or its actor alone.
+    """A trained agent, which acts by planning (paper, section 4.3) or by its actor.
 
     It reads ``"observation"`` ``[*batch, o]`` and writes ``"action"`` ``[*batch, m]`` in physical
-    units. The parts are attributes and may be ``None``; they are shared, not copied, so an agent
-    made during training follows it.
+    units. Model, actor and critics are attributes and may be ``None``. They are shared and not
+    copied, so an agent that is made during training changes with it.
+
+    Another sort of agent is a subclass with another :attr:`kind` that overrides
+    :meth:`modules_by_name`, :attr:`config`, :meth:`build_modules` and :meth:`from_config`; it can
+    then be registered, saved, loaded and evaluated like this one
+    (:func:`~phihp_torchrl.deployment.register_agent`).
 
     Args:
-        task: what it was trained for.
-        dynamics: the learned transition, which the planner needs.
+        task: the task that it was trained for.
+        dynamics: the model, which the planner needs.
         actor: the policy.
-        qvalue: the critics, for beyond the planner's horizon.
-        planner_config: the planner's settings; ``None`` for an agent without one.
+        qvalue: the critics, for the value beyond the planner's horizon.
+        planner_config: settings of the planner; ``None`` for an agent without a planner.
         use_planner: whether to plan; ``False`` is the actor alone. See also :meth:`actor_alone`.
-        compile: whether to compile the plan (10 to 40 s at first, from the cache afterwards).
-        metadata: what to know about it (seed, commit, returns …), for people; JSON.
+        compile: whether to compile the plan (10 to 40 s the first time, from the cache afterwards).
+        metadata: further information for people (seed, commit, returns …), as JSON values.
 
     Raises:
-        ValueError: if the parts do not suffice to act; when called, for an observation that is
-            missing, not finite, or of the wrong shape, dtype or device.
+        ConfigError: if there is neither a planner with a model nor an actor.
+        ValueError: when called, for an observation that is missing, not finite, or of the wrong
+            shape, dtype or device.
 
     Examples:
         >>> from tensordict import TensorDict
         >>> from phihp_torchrl import get_task
+        >>> from phihp_torchrl.planners import CEMConfig
         >>> task = get_task("pendulum")
         >>> agent = Agent(
         ...     task,
         ...     dynamics=HybridDynamics.hybrid(task),
         ...     actor=Actor(task),
         ...     qvalue=TwinQ(task),
-        ...     planner_config=PlannerConfig(),
+        ...     planner_config=CEMConfig(),
         ... )
-        >>> observation = task.system.observe(task.reset.sample([4]))
+        >>> observation = task.observe(task.reset.sample([4]))
         >>> agent(TensorDict(observation=observation, batch_size=[4]))["action"].shape
         torch.Size([4, 1])
     """
+
+    kind: ClassVar[str] = "phihp"
+    """The name of this sort of agent in files."""
+
+    planner: SamplingPlanner | None
 
     def __init__(
         self,
@@ -60,7 +73,7 @@ class Agent(TensorDictModuleBase):
         dynamics: HybridDynamics | None = None,
         actor: Actor | TensorDictModuleBase | None = None,
         qvalue: TwinQ | TensorDictModuleBase | None = None,
-        planner_config: PlannerConfig | None = None,
+        planner_config: SearchConfig | None = None,
         use_planner: bool = True,
         compile: bool | dict[str, Any] = False,
         metadata: Mapping[str, Any] | None = None,
@@ -80,12 +93,17 @@ class Agent(TensorDictModuleBase):
         self.metadata = dict(metadata or {})
         self.planner = None
         if use_planner and planner_config is not None:
-            if dynamics is None:
-                raise ValueError("dynamics: expected a model for the planner, got None.")
-            world_model = TaskWorldModel(task, dynamics)
-            self.planner = make_planner(world_model, actor, qvalue, planner_config, compile=compile)
+            self.planner = self._make_planner(planner_config, compile)
         elif actor is None:
-            raise ValueError("actor: expected one for an agent that does not plan, got None.")
+            raise ConfigError("actor", "expected one for an agent that does not plan, got None.")
+
+    def _make_planner(
+        self, config: SearchConfig, compile: bool | dict[str, Any]
+    ) -> SamplingPlanner:
+        if self.dynamics is None:
+            raise ConfigError("dynamics", "expected a model for the planner, got None.")
+        world_model = TaskWorldModel(self.task, self.dynamics)
+        return make_planner(world_model, self.actor, self.qvalue, config, compile=compile)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"`` ``[*batch, m]`` for ``"observation"`` ``[*batch, o]``; no gradients.
@@ -95,29 +113,100 @@ class Agent(TensorDictModuleBase):
         """
         with torch.no_grad():
             if self.planner is not None:
-                return self.planner(tensordict)
+                return self._plan(tensordict)
             self._check(tensordict.get("observation", None), tensordict.batch_size)
             return self.actor(tensordict)  # type: ignore[misc]  # one of the two is there
 
+    def _plan(self, tensordict: TensorDictBase) -> TensorDictBase:
+        assert self.planner is not None
+        return self.planner(tensordict)
+
     def reset(self) -> None:
-        """Forget the previous plan: a new episode starts."""
+        """Drop the previous plan, at the start of an episode."""
         if self.planner is not None:
             self.planner.reset()
 
     def actor_alone(self) -> Agent:
-        """The same agent without planning, on the same modules."""
+        """Return the same agent without planning, with the same modules."""
+        return self.with_planner(None)
+
+    def with_planner(self, config: SearchConfig | None, **options: Any) -> Agent:
+        """Return an agent with the same modules and other planner settings, or without planning.
+
+        Args:
+            config: settings of the planner; ``None`` for the actor alone.
+            options: ``compile``.
+        """
+        parts = {name: getattr(self, name) for name in ("dynamics", "actor", "qvalue")}
         return Agent(
             self.task,
-            dynamics=self.dynamics,
-            actor=self.actor,
-            qvalue=self.qvalue,
-            planner_config=self.planner_config,
-            use_planner=False,
+            **parts,
+            planner_config=config or self.planner_config,
+            use_planner=config is not None,
             metadata=self.metadata,
+            **options,
         )
 
+    # Description, from which the agent is built again.
+
+    def modules_by_name(self) -> dict[str, nn.Module]:
+        """Return the modules that have weights, without their TensorDict modules."""
+        parts = {
+            "dynamics": self.dynamics,
+            "actor": getattr(self.actor, "module", self.actor),
+            "qvalue": getattr(self.qvalue, "module", self.qvalue),
+        }
+        return {name: part for name, part in parts.items() if part is not None}
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Plain values from which the agent can be built again, without the weights.
+
+        Raises:
+            ConfigError: for a module without an attribute ``config`` of that sort.
+        """
+        described: dict[str, Any] = {}
+        for name, part in self.modules_by_name().items():
+            config = getattr(part, "config", None)
+            if not isinstance(config, dict):
+                raise ConfigError(
+                    name,
+                    "expected a part that says how it is built (`config`, `from_config`), "
+                    f"got a {type(part).__name__}.",
+                )
+            described[name] = config
+        planner = self.planner_config
+        return {**described, "planner": None if planner is None else kind_mapping(planner)}
+
+    @classmethod
+    def build_modules(cls, task: Task, config: Mapping[str, Any]) -> dict[str, Any]:
+        """Build the modules that :attr:`config` describes, untrained."""
+        classes = {"dynamics": HybridDynamics, "actor": Actor, "qvalue": TwinQ}
+        return {
+            name: classes[name].from_config(task, config[name])  # type: ignore[attr-defined]
+            for name in classes
+            if config.get(name) is not None
+        }
+
+    @classmethod
+    def from_config(
+        cls, task: Task, config: Mapping[str, Any], modules: Mapping[str, Any], **options: Any
+    ) -> Agent:
+        """Build the agent that :attr:`config` describes, from these modules.
+
+        Args:
+            task: the task that it was trained for.
+            config: its description.
+            modules: the modules of :meth:`build_modules`, with their weights.
+            options: ``use_planner``, ``compile`` and ``metadata``.
+        """
+        planner = config.get("planner")
+        if planner is not None:
+            planner = read_kind(PLANNERS, planner, "planner")
+        return cls(task, **modules, planner_config=planner, **options)
+
     def _check(self, observation: Tensor | None, batch: torch.Size) -> None:
-        shape = [*batch, self.task.system.observation_dim]
+        shape = [*batch, self.task.observation_dim]
         if observation is None:
             raise ValueError(f"observation: expected a tensor of shape {shape}, got none.")
         parameter = next(self.actor.parameters(), observation)  # type: ignore[union-attr]

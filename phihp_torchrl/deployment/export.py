@@ -1,4 +1,4 @@
-"""An agent's planner as one file that runs without Python or without torch."""
+"""Export of an agent's planner as one file, which runs without Python or without torch."""
 
 from __future__ import annotations
 
@@ -8,31 +8,33 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment.agent import Agent
-from phihp_torchrl.planners import plan
+from phihp_torchrl.planners import CEMPlanner, cem_plan
 
 Act = Callable[[Tensor, Tensor], Tensor]
-"""Observation ``[o]`` and standard normal noise (see :attr:`PlanModule.noise_shape`) to action."""
+"""A function from observation ``[o]`` and standard normal noise to an action ``[m]``."""
 
 
 class PlanModule(nn.Module):
-    """One plan as a module of tensors: observation ``[o]`` and noise in, action ``[m]`` out.
+    """One plan of an agent as a module of tensors, for export: observation and noise to action.
 
-    Nothing random happens in it and nothing is remembered, so plans are made anew at every step,
-    whatever ``replan_every`` and ``warm_start`` say.
+    It reads an observation ``[o]`` and standard normal noise of shape ``noise_shape``, and returns
+    an action ``[m]``. It draws no random numbers and keeps no plan between steps, so it plans at
+    every step, regardless of ``replan_every`` and ``warm_start``.
 
     Args:
-        agent: an agent with a planner.
+        agent: an agent that plans by a :class:`~phihp_torchrl.CEMPlanner`.
 
     Raises:
-        ValueError: for an agent without one, or whose model does not compile.
+        ConfigError: for an agent without such a planner, or whose model does not compile.
 
     Examples:
         >>> from phihp_torchrl import HybridDynamics, get_task
         >>> from phihp_torchrl.agents import Actor, TwinQ
-        >>> from phihp_torchrl.planners.factory import PlannerConfig
+        >>> from phihp_torchrl.planners import CEMConfig
         >>> task = get_task("pendulum")
-        >>> parts = {"actor": Actor(task), "qvalue": TwinQ(task), "planner_config": PlannerConfig()}
+        >>> parts = {"actor": Actor(task), "qvalue": TwinQ(task), "planner_config": CEMConfig()}
         >>> module = PlanModule(Agent(task, dynamics=HybridDynamics.hybrid(task), **parts))
         >>> module(torch.tensor([1.0, 0.0, 0.0]), torch.randn(module.noise_shape)).shape
         torch.Size([1])
@@ -42,33 +44,48 @@ class PlanModule(nn.Module):
         super().__init__()
         planner = agent.planner
         if planner is None:
-            raise ValueError("agent: expected one with a planner, got one that acts without.")
-        if not planner.env.tensor_model.compiles:
-            raise ValueError("agent: expected a model whose integrator compiles, got another.")
+            raise ConfigError("agent", "expected one with a planner, got one that acts without.")
+        if not isinstance(planner, CEMPlanner):
+            raise ConfigError(
+                "agent",
+                f"expected one that plans with a CEMPlanner, got a {type(planner).__name__}: it "
+                "starts each plan from the one before, and a plan by itself is not what it does.",
+            )
+        if not getattr(planner.env.tensor_model, "compiles", True):
+            raise ConfigError("agent", "expected a model whose integrator compiles, got another.")
         self.planner = planner  # whose parameters are then this module's
-        self.noise_shape = planner.settings.noise_shape((), agent.task.system.action_dim)
-        self._observation = agent.task.system.observe(agent.task.reset.sample([]))
+        self.noise_shape = planner.settings.noise_shape((), agent.task.action_dim)
+        self._observation = agent.task.observe(agent.task.reset.sample([]))
 
     def forward(self, observation: Tensor, noise: Tensor) -> Tensor:
-        """The first action of a plan."""
+        """Return the first action of a plan, ``[m]``."""
         planner = self.planner
-        found = plan(observation, noise, problem=planner.problem(), settings=planner.settings)
+        found = cem_plan(observation, noise, problem=planner.problem(), settings=planner.settings)
         return found.actions[0]
 
     def example(self) -> tuple[Tensor, Tensor]:
-        """Inputs of the right shapes."""
+        """Return an observation and noise of the right shapes."""
         return self._observation, torch.randn(self.noise_shape)
 
 
 def export_aoti(module: PlanModule, path: str | Path) -> Act:
-    """Write an AOTInductor package (``.pt2``), which C++ and Python run.
+    """Write a plan as an AOTInductor package (``.pt2``), which C++ and Python can run.
 
     Args:
         module: the plan.
-        path: where to write it.
+        path: the file to write.
 
     Returns:
-        What the file computes, loaded again.
+        The function in the file, loaded again: observation ``[o]`` and noise to action ``[m]``.
+
+    Examples:
+        The export compiles C++ code, which takes about a minute.
+
+        >>> from phihp_torchrl import load_agent
+        >>> module = PlanModule(load_agent("results/agents/pendulum"))  # doctest: +SKIP
+        >>> act = export_aoti(module, "plan.pt2")  # doctest: +SKIP
+        >>> act(*module.example()).shape  # doctest: +SKIP
+        torch.Size([1])
     """
     with torch.no_grad():
         program = torch.export.export(module, module.example())
@@ -77,17 +94,27 @@ def export_aoti(module: PlanModule, path: str | Path) -> Act:
 
 
 def export_onnx(module: PlanModule, path: str | Path) -> Act:
-    """Write an ONNX model, which ONNX Runtime runs.
+    """Write a plan as an ONNX model, which ONNX Runtime can run.
 
     Args:
         module: the plan.
-        path: where to write it.
+        path: the file to write.
 
     Returns:
-        What the file computes, loaded into ONNX Runtime.
+        The function in the file, loaded into ONNX Runtime: observation ``[o]`` and noise to action
+        ``[m]``.
 
     Raises:
         ImportError: if the ``onnx`` extra is not installed.
+
+    Examples:
+        This needs the ``onnx`` extra.
+
+        >>> from phihp_torchrl import load_agent
+        >>> module = PlanModule(load_agent("results/agents/pendulum"))  # doctest: +SKIP
+        >>> act = export_onnx(module, "plan.onnx")  # doctest: +SKIP
+        >>> act(*module.example()).shape  # doctest: +SKIP
+        torch.Size([1])
     """
     try:
         import onnxruntime
@@ -120,12 +147,12 @@ def export_onnx(module: PlanModule, path: str | Path) -> Act:
 
 
 def largest_differences(act: Act, module: PlanModule, observations: Tensor) -> Tensor:
-    """How far exported actions are from the eager ones at most, ``[N]``, same noise.
+    """Return the largest difference of exported and eager actions for each observation, ``[N]``.
 
     Args:
         act: the exported plan.
-        module: the eager one.
-        observations: where to plan from, ``[N, o]``.
+        module: the eager plan, which gets the same noise.
+        observations: observations to plan from, ``[N, o]``.
     """
     differences = []
     with torch.no_grad():

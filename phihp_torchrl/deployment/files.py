@@ -1,4 +1,4 @@
-"""Agents on disk: one JSON file and one of weights, without pickle."""
+"""Agents on disk: one JSON file and one safetensors file of weights, without pickle."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,53 +16,83 @@ import torch
 from safetensors.torch import save as dump_tensors
 from torch import Tensor, nn
 
+from phihp_torchrl.config import ConfigError, Registry
 from phihp_torchrl.deployment.agent import Agent
-from phihp_torchrl.deployment.blueprint import TaskSignature
-from phihp_torchrl.deployment.kinds import AnyBlueprint, describe, modules
-from phihp_torchrl.deployment.reading import (
-    MAX_JSON_BYTES,
-    AgentError,
-    read_blueprint,
-    read_json,
-    read_weights,
+from phihp_torchrl.deployment.formats import (
+    BOUNDS_OF_VERSION_1,
+    FORMAT,
+    FORMAT_VERSION,
+    TaskSignature,
+    upgrade,
 )
+from phihp_torchrl.deployment.reading import MAX_JSON_BYTES, AgentError, read_json, read_weights
+from phihp_torchrl.origin import package_version
 from phihp_torchrl.tasks import Task, get_task
 
 AGENT_FILE = "agent.json"
 WEIGHTS_FILE = "weights.safetensors"
-FORMAT = "phihp_torchrl agent"
-FORMAT_VERSION = 1
+
+AGENT_KINDS: Registry[type[Agent]] = Registry("kind")
+"""Registered classes of agents, by the ``kind`` in their files."""
+
+AGENT_KINDS.register(Agent.kind, Agent)
+
+# Of ours that come with a folder of their own, where it is: a file may name a kind, never a module.
+_HOMES = {"td-mpc": "phihp_torchrl.tdmpc"}
+
+
+def register_agent(agent: type[Agent], *, replace: bool = False) -> type[Agent]:
+    """Register a class of agents, so that files of its ``kind`` can be loaded; returns the class.
+
+    Raises:
+        ConfigError: if the kind is taken and ``replace`` is false.
+
+    Examples:
+        >>> register_agent(Agent, replace=True).kind
+        'phihp'
+    """
+    return AGENT_KINDS.register(agent.kind, agent, replace=replace)
 
 
 def save_agent(
     agent: Agent, directory: str | os.PathLike[str], *, metadata: Mapping[str, Any] | None = None
 ) -> Path:
-    """Write ``agent.json`` and ``weights.safetensors``; other files in ``directory`` stay.
+    """Save an agent as ``agent.json`` and ``weights.safetensors``, keeping other files.
 
-    Each file is replaced as a whole, and a mixture of two savings is noticed on loading.
+    Each file is replaced atomically, and loading refuses files of two different saves.
 
     Args:
         agent: the agent, on any device.
-        directory: where to; made if absent.
-        metadata: what people should know, in JSON with finite numbers: by convention ``seed``,
-            ``commit``, ``command``, ``samples``, ``config`` and the ``returns`` it earned. Defaults
-            to the agent's own.
+        directory: the directory; it is made if absent.
+        metadata: further information for people, as JSON values with finite numbers; by convention
+            ``seed``, ``commit``, ``command``, ``samples``, ``config`` and ``returns``. Defaults to
+            ``agent.metadata``.
 
     Returns:
         The directory.
 
     Raises:
-        AgentError: for an agent with parts that are not this package's, with weights that are not
-            finite, or metadata that is not JSON.
+        AgentError: for an agent with modules that have no ``config``, with weights that are not
+            finite, or with metadata that is not JSON.
+
+    Examples:
+        >>> import tempfile
+        >>> from phihp_torchrl import get_task
+        >>> from phihp_torchrl.agents import Actor
+        >>> agent = Agent(get_task("pendulum"), actor=Actor(get_task("pendulum")))
+        >>> with tempfile.TemporaryDirectory() as directory:
+        ...     sorted(path.name for path in save_agent(agent, directory).iterdir())
+        ['agent.json', 'weights.safetensors']
     """
     try:
-        blueprint = describe(agent)
-        blueprint.build_modules(agent.task)  # what can not be built again should not be saved
-    except (ValueError, TypeError) as error:
+        config = agent.config
+        # What can not be built again should not be saved.
+        type(agent).build_modules(agent.task, json.loads(json.dumps(config)))
+    except (ValueError, TypeError, KeyError) as error:
         raise AgentError(f"agent: it can not be saved: {error}") from error
     weights = {
         name: tensor.detach().cpu().contiguous().clone()
-        for name, tensor in _tensors(modules(agent)).items()
+        for name, tensor in _tensors(agent.modules_by_name()).items()
     }
     for name, tensor in weights.items():
         if not tensor.isfinite().all():
@@ -70,8 +101,10 @@ def save_agent(
     content = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "package_version": _package_version(),
-        **asdict(blueprint),
+        "package_version": package_version(),
+        "kind": agent.kind,
+        "task": asdict(TaskSignature.of(agent.task)),
+        **config,
         "weights_sha256": hashlib.sha256(data).hexdigest(),
         "metadata": dict(agent.metadata if metadata is None else metadata),
     }
@@ -104,14 +137,14 @@ def load_agent(
 ) -> Agent:
     """Load a saved agent, ready to act.
 
-    Nothing in the files is executed, and no memory is taken for weights before they are
-    known to fit.
+    Nothing in the files is executed, and the sizes of the weights are checked before memory is
+    allocated for them.
 
     Args:
-        directory: where :func:`save_agent` wrote it.
+        directory: the directory that :func:`save_agent` wrote.
         planner: whether it plans; ``False`` is the actor alone.
-        task: the task it must be for; one that is not registered can be given itself.
-        device: where it acts. Defaults to the CPU.
+        task: the task that it must be for: a name, or a task that need not be registered.
+        device: device of the agent. Defaults to the CPU.
         compile: whether to compile the plan.
 
     Raises:
@@ -120,8 +153,8 @@ def load_agent(
     Examples:
         >>> import tempfile
         >>> from phihp_torchrl import get_task, load_agent
-        >>> from phihp_torchrl.agents.networks import Actor
-        >>> from phihp_torchrl.deployment import Agent, save_agent
+        >>> from phihp_torchrl import Agent, save_agent
+        >>> from phihp_torchrl.agents import Actor
         >>> task = get_task("pendulum")
         >>> with tempfile.TemporaryDirectory() as directory:
         ...     _ = save_agent(Agent(task, actor=Actor(task)), directory, metadata={"seed": 0})
@@ -134,37 +167,63 @@ def load_agent(
     path = directory / AGENT_FILE
     content = read_json(path)
     _check_format(path, content)
-    blueprint = read_blueprint(path, content)
-    task = _resolve_task(path, blueprint.task, task)
-    weights = _read_weights(directory / WEIGHTS_FILE, blueprint, task, content)
+    try:
+        content = upgrade(content)
+        kind = _find_kind(content.get("kind"))
+        signature = _read_signature(content["task"])
+    except KeyError as error:
+        raise AgentError(f"{path}: expected the key {error}, found none.") from error
+    except (ValueError, TypeError, AttributeError) as error:
+        raise AgentError(f"{path}: {error}") from error
+    task = _resolve_task(path, signature, task)
+    weights = _read_weights(directory / WEIGHTS_FILE, kind, task, content)
     device = _check_device(device)
     try:
-        parts = blueprint.build_modules(task)
+        parts = kind.build_modules(task, content)
         for name, part in parts.items():
             start = f"{name}."
             own = {k.removeprefix(start): t for k, t in weights.items() if k.startswith(start)}
             part.load_state_dict(own)
             part.to(device).requires_grad_(False).eval()
-        return blueprint.assemble(
+        return kind.from_config(
             task,
+            content,
             parts,
             use_planner=planner,
             compile=compile,
             metadata=content["metadata"],
         )
+    except KeyError as error:
+        raise AgentError(f"{path}: expected the key {error}, found none.") from error
     except (ValueError, TypeError, RuntimeError) as error:
         raise AgentError(f"{path}: the agent can not be built: {error}") from error
+
+
+def _find_kind(kind: Any) -> type[Agent]:
+    if isinstance(kind, str) and kind in _HOMES and kind not in AGENT_KINDS:
+        import_module(_HOMES[kind])
+    return AGENT_KINDS.find(kind)
+
+
+def _read_signature(mapping: Mapping[str, Any]) -> TaskSignature:
+    names = {field.name for field in fields(TaskSignature)}
+    if set(mapping) != names:
+        raise ConfigError("task", f"expected the keys {sorted(names)}, got {sorted(mapping)}.")
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in mapping.items()
+    }
+    return TaskSignature(**values)
 
 
 def _check_format(path: Path, content: dict[str, Any]) -> None:
     if content.get("format") != FORMAT:
         raise AgentError(f"{path}: expected format {FORMAT!r}, got {content.get('format')!r}.")
     version = content.get("format_version")
-    if version != FORMAT_VERSION:
+    if version not in range(1, FORMAT_VERSION + 1) or isinstance(version, bool):
         raise AgentError(
-            f"{path}: expected format_version {FORMAT_VERSION}, got {version!r}; it was "
+            f"{path}: expected format_version 1 to {FORMAT_VERSION}, got {version!r}; it was "
             f"written by version {content.get('package_version')!r} of this package, here is "
-            f"{_package_version()}."
+            f"{package_version()}."
         )
     if not isinstance(content.get("metadata"), dict):
         raise AgentError(
@@ -195,20 +254,17 @@ def _resolve_task(path: Path, saved: TaskSignature, wanted: str | Task | None) -
 
 
 def _read_weights(
-    path: Path, blueprint: AnyBlueprint, task: Task, content: dict[str, Any]
+    path: Path, kind: type[Agent], task: Task, content: dict[str, Any]
 ) -> dict[str, Tensor]:
     agent_path = path.with_name(AGENT_FILE)
     try:
         with torch.device("meta"):  # shapes without memory
-            parts = blueprint.build_modules(task)
-    except (ValueError, TypeError, RuntimeError) as error:
+            parts = kind.build_modules(task, content)
+    except KeyError as error:
+        raise AgentError(f"{agent_path}: expected the key {error}, found none.") from error
+    except (ValueError, TypeError, RuntimeError, AttributeError) as error:
         raise AgentError(f"{agent_path}: {error}") from error
-    weights, data = read_weights(path, _tensors(parts))
-    for name, tensor in weights.items():
-        if name.endswith(".action_high") and tensor.tolist() != list(task.action_high):
-            raise AgentError(
-                f"{path}: {name}: expected the task's {task.action_high}, got {tensor.tolist()}."
-            )
+    weights, data = read_weights(path, _tensors(parts), ignore=f".{BOUNDS_OF_VERSION_1}")
     if hashlib.sha256(data).hexdigest() != content.get("weights_sha256"):
         raise AgentError(
             f"{path}: expected the weights that {AGENT_FILE} was written with, got others; "
@@ -232,9 +288,3 @@ def _check_device(device: torch.device | str | None) -> torch.device:
         raise AgentError(
             f"device: expected one that works here, got {device!r}: {error}"
         ) from error
-
-
-def _package_version() -> str:
-    from phihp_torchrl import __version__
-
-    return __version__

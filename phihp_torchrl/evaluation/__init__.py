@@ -1,4 +1,4 @@
-"""What an agent is worth: returns, latency, pictures and tables."""
+"""Evaluation of agents: returns, latency, pictures and tables."""
 
 from __future__ import annotations
 
@@ -8,26 +8,18 @@ from phihp_torchrl.evaluation.latency import Latency, measure_latency
 from phihp_torchrl.evaluation.published import PUBLISHED, TARGETS, Published
 from phihp_torchrl.evaluation.returns import Evaluation, evaluate
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED, check_training_seed, evaluation_seed
+from phihp_torchrl.evaluation.show import show_episode
 from phihp_torchrl.evaluation.table import TaskResult, markdown_table, mean_and_std, returns_table
 from phihp_torchrl.evaluation.video import write_gif
 
 __all__ = [
-    "EVALUATION_SEED",
-    "PUBLISHED",
-    "TARGETS",
     "Episode",
     "Evaluation",
-    "Latency",
-    "Published",
-    "TaskResult",
-    "check_training_seed",
     "episode_figure",
     "evaluate",
     "evaluation_seed",
-    "markdown_table",
-    "mean_and_std",
     "measure_latency",
     "play_episode",
-    "returns_table",
+    "show_episode",
     "write_gif",
 ]

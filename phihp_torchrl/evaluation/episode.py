@@ -1,4 +1,4 @@
-"""One episode in full, to look at: states, actions, rewards and pictures."""
+"""One episode in full: states, actions, rewards and pictures."""
 
 from __future__ import annotations
 
@@ -9,27 +9,36 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import step_mdp
 
-from phihp_torchrl.envs.worlds import make_world
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
-from phihp_torchrl.tasks import Task, get_task
+from phihp_torchrl.tasks import Task, find_task
+from phihp_torchrl.worlds import SimulatedWorld, World
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What happened in an episode of ``T`` steps.
+    """The states, actions, rewards and pictures of an episode of ``T`` steps.
 
     Args:
         task: the task.
-        states: physical states, ``[T + 1, n]``.
+        states: states as observed, angles in [-π, π], ``[T + 1, n]``.
         actions: actions in physical units, ``[T, m]``.
         rewards: rewards, ``[T]``.
         terminated: whether it ended before time ran out.
         frames: pictures ``[F, height, width, 3]``, uint8, of the start and of every
             ``frame_steps``-th step; empty if it was not rendered.
         frame_steps: steps from one picture to the next.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> steps = np.zeros((3, 2)), np.zeros((2, 1)), np.array([-1.0, -2.0])
+        >>> no_frames = np.zeros((0, 0, 0, 3), dtype=np.uint8)
+        >>> Episode(get_task("pendulum"), *steps, False, no_frames, frame_steps=1).total_reward
+        -3.0
     """
 
     task: Task
@@ -51,75 +60,97 @@ def play_episode(
     task: str | Task,
     *,
     seed: int = EVALUATION_SEED,
+    world: World | None = None,
     max_steps: int | None = None,
     render: bool = False,
     frames_per_second: float = 20.0,
     max_frames: int = 200,
     device: torch.device | str | None = None,
 ) -> Episode:
-    """Play one episode in the task's gymnasium world. The global random state is left as it was.
+    """Play one episode in a world and record it. Global random states are restored.
 
     Args:
-        policy: reads ``"observation"``, writes ``"action"``; called with batch size ``[]``.
+        policy: a module that reads ``"observation"`` and writes ``"action"``, called with batch
+            size ``[]``.
         task: a task or the name of a registered one.
-        seed: seed of the start and of the policy's noise.
-        max_steps: stop earlier than the task does.
+        seed: seed of the first state and of the policy's noise.
+        world: the world. Defaults to the simulated world of the task.
+        max_steps: largest number of steps, if smaller than that of the task.
         render: whether to take pictures; needs the ``rendering`` extra.
-        frames_per_second: pictures for a second of the world's time, at most one a step.
-        max_frames: pictures at most, from the beginning; drawing takes longer than acting.
-        device: where the policy acts.
+        frames_per_second: pictures for each second in the world, at most one for each step.
+        max_frames: largest number of pictures; later steps have none.
+        device: device of the policy.
+
+    Returns:
+        The recorded episode.
 
     Raises:
-        ImportError: if pictures are wanted and pygame is not installed.
-        ValueError: if pictures are wanted of a system that has none, or a number is not positive.
+        ImportError: if ``render`` is set and pygame is not installed.
+        ConfigError: if ``render`` is set and the world has no pictures, or a number is not
+            positive.
+
+    Examples:
+        >>> from phihp_torchrl import Agent, get_task
+        >>> from phihp_torchrl.agents import Actor
+        >>> agent = Agent(get_task("pendulum"), actor=Actor(get_task("pendulum")))
+        >>> episode = play_episode(agent, "pendulum", max_steps=5)
+        >>> episode.states.shape, episode.actions.shape, len(episode.frames)
+        ((6, 2), (5, 1), 0)
     """
-    task = get_task(task) if isinstance(task, str) else task
+    task = find_task(task)
     steps = task.max_steps if max_steps is None else min(max_steps, task.max_steps)
     if steps < 1:
-        raise ValueError(f"max_steps: expected a positive number, got {max_steps}.")
+        raise ConfigError("max_steps", f"expected a positive number, got {max_steps}.")
     if not frames_per_second > 0:
-        raise ValueError(f"frames_per_second: expected a positive number, got {frames_per_second}.")
+        raise ConfigError(
+            "frames_per_second", f"expected a positive number, got {frames_per_second}."
+        )
     frame_steps = max(1, round(1.0 / (frames_per_second * task.time_step)))
-    world = make_world(task, render_mode=_render_mode() if render else None)
-    inner: Any = world.unwrapped
-    try:
-        with torch.random.fork_rng(devices=[]), torch.no_grad():
-            torch.manual_seed(seed)
-            observation, _ = world.reset(seed=seed)
-            states, actions, rewards = [inner.state], [], []
-            frames: list[Any] = [world.render()] if render else []
-            terminated = False
-            for step in range(1, steps + 1):
-                tensordict = TensorDict(
-                    observation=torch.from_numpy(observation).to(device),
-                    is_init=torch.tensor([step == 1], device=device),
-                )
-                action = policy(tensordict)["action"].cpu().numpy()
-                observation, reward, terminated, truncated, _ = world.step(action)
-                states.append(inner.state)
-                actions.append(action)
-                rewards.append(reward)
-                if render and step % frame_steps == 0 and len(frames) < max_frames:
-                    frames.append(world.render())
-                if terminated or truncated:
-                    break
-    finally:
-        world.close()
+    world = SimulatedWorld(task) if world is None else world
+    if render:
+        _check_pygame(world)
+    env = world.make_env(render=render)
+    frames: list[Any] = []
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(seed)
+        env.set_seed(seed)
+        data = env.reset()
+        if render:
+            frames.append(_picture(world, env))
+        rows = []
+        for step in range(1, steps + 1):
+            data["is_init"] = torch.tensor([step == 1])
+            data["action"] = policy(data.to(device) if device else data)["action"].cpu()
+            data = env.step(data)
+            rows.append(data)
+            if render and step % frame_steps == 0 and len(frames) < max_frames:
+                frames.append(_picture(world, env))
+            if data["next", "done"].any():
+                break
+            data = step_mdp(data)
+    observed = [rows[0]["observation"], *(row["next", "observation"] for row in rows)]
+    states = task.locate(torch.stack(observed).double())
     return Episode(
         task=task,
-        states=np.stack(states),
-        actions=np.stack(actions).astype(np.float64),
-        rewards=np.array(rewards, dtype=np.float64),
-        terminated=terminated,
+        states=states.numpy(),
+        actions=torch.stack([row["action"] for row in rows]).double().numpy(),
+        rewards=torch.stack([row["next", "reward"].reshape(()) for row in rows]).double().numpy(),
+        terminated=bool(rows[-1]["next", "terminated"].any()),
         frames=np.stack(frames) if render else np.zeros((0, 0, 0, 3), dtype=np.uint8),
         frame_steps=frame_steps,
     )
 
 
-def _render_mode() -> str:
-    if importlib.util.find_spec("pygame") is None:
+def _picture(world: World, env: EnvBase) -> NDArray[Any]:
+    picture = world.picture(env)
+    if picture is None:
+        raise ConfigError("render", f"expected a world that draws pictures, {world} draws none.")
+    return picture
+
+
+def _check_pygame(world: World) -> None:
+    if isinstance(world, SimulatedWorld) and importlib.util.find_spec("pygame") is None:
         raise ImportError(
             "pygame: expected it to draw pictures, it is not installed; "
             "`pip install 'phihp_torchrl[rendering]'` brings it."
         )
-    return "rgb_array"

@@ -1,4 +1,4 @@
-"""Pictures of what an agent does."""
+"""Figures of episodes."""
 
 from __future__ import annotations
 
@@ -14,13 +14,21 @@ from phihp_torchrl.evaluation.episode import Episode
 
 
 def episode_figure(episode: Episode) -> Figure:
-    """States, actions and rewards of an episode over time; angles in [-π, π).
+    """Plot states, actions and rewards of an episode over time; angles in [-π, π).
 
     Args:
         episode: the episode.
 
     Returns:
-        A figure, one panel a quantity.
+        A figure with a panel for each state, each action and the reward.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> steps = np.zeros((3, 2)), np.zeros((2, 1)), np.array([-1.0, -2.0])
+        >>> no_frames = np.zeros((0, 0, 0, 3), dtype=np.uint8)
+        >>> figure = episode_figure(Episode(get_task("pendulum"), *steps, False, no_frames, 1))
+        >>> [panel.get_ylabel() for panel in figure.axes]
+        ['theta', 'theta_dot', 'torque', 'reward']
     """
     task, system = episode.task, episode.task.system
     panels = len(system.state_names) + len(system.action_names) + 1
@@ -34,11 +42,11 @@ def episode_figure(episode: Episode) -> Figure:
             axis.set_yticks([-math.pi, 0, math.pi], ["-π", "0", "π"])
             axis.set_ylim(-1.1 * math.pi, 1.1 * math.pi)
         _line(axis, time, values, name, "C0")
-    bounds = zip(system.action_names, task.action_high, strict=True)
-    for i, (name, high) in enumerate(bounds):
+    bounds = zip(system.action_names, task.action_low or (), task.action_high, strict=True)
+    for i, (name, low, high) in enumerate(bounds):
         axis = next(axes)
         axis.step(time[:-1], episode.actions[:, i], where="post", color="C1", linewidth=1)
-        axis.set_ylim(-1.1 * high, 1.1 * high)
+        axis.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
         _label(axis, name)
     _line(last := next(axes), time[:-1], episode.rewards, "reward", "C2")
     last.set_xlabel("time (s)")
@@ -48,7 +56,7 @@ def episode_figure(episode: Episode) -> Figure:
 
 
 def _with_gaps(angle: np.ndarray) -> np.ndarray:
-    """No line across the picture where an angle passes π."""
+    """Insert NaN where an angle passes π, so that no line is drawn there."""
     jumps = np.abs(np.diff(angle, prepend=angle[:1])) > math.pi
     return np.where(jumps, np.nan, angle)
 

@@ -1,4 +1,4 @@
-"""The paper's numbers and ours to reach, as data (SPEC section 6)."""
+"""The published results (paper, main table), and this package's targets."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 
 class Published(NamedTuple):
-    """A row of the paper: mean ± std over 10 runs.
+    """A published result: mean ± std over 10 runs.
 
     Attributes:
-        return_mean: return.
-        return_std: its standard deviation.
+        return_mean: mean return.
+        return_std: standard deviation of the return.
         samples: real samples, in thousands; ``None`` for an oracle, which has the true model.
         milliseconds: time of an action, on an Apple M1.
     """
@@ -79,4 +79,4 @@ TARGETS = MappingProxyType(
         "acrobot-swingup": 390.0,
     }
 )
-"""The mean return of the planner that this package is to reach, by task; ours, not published."""
+"""The mean return that this package's planner should reach, by task; not from the paper."""

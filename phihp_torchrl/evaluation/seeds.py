@@ -1,23 +1,25 @@
-"""Seeds of evaluation, apart from those of training."""
+"""Seeds of evaluation, which differ from those of training."""
 
 from __future__ import annotations
 
+from phihp_torchrl.config import ConfigError
+
 EVALUATION_SEED = 1_000_000
-"""Seeds from here on belong to evaluation; training and the choice of actors use smaller ones."""
+"""The first seed of evaluation; training and the choice of actors use smaller seeds."""
 
 
 def evaluation_seed(k: int = 0) -> int:
-    """The ``k``-th seed of evaluation, which no training uses.
+    """Return the ``k``-th seed of evaluation, which no training uses.
 
     Raises:
-        ValueError: for a negative number.
+        ConfigError: for a negative number.
 
     Examples:
         >>> evaluation_seed(3)
         1000003
     """
     if k < 0:
-        raise ValueError(f"k: expected a number >= 0, got {k}.")
+        raise ConfigError("k", f"expected a number >= 0, got {k}.")
     return EVALUATION_SEED + k
 
 
@@ -25,11 +27,15 @@ def check_training_seed(seed: int) -> int:
     """Return ``seed`` if training may use it.
 
     Raises:
-        ValueError: for a negative seed and for those of evaluation.
+        ConfigError: for a negative seed, and for a seed of evaluation.
+
+    Examples:
+        >>> check_training_seed(3)
+        3
     """
     if not 0 <= seed < EVALUATION_SEED:
-        raise ValueError(
-            f"seed: expected 0 to {EVALUATION_SEED - 1} (later ones are for evaluation), "
-            f"got {seed}."
+        raise ConfigError(
+            "seed",
+            f"expected 0 to {EVALUATION_SEED - 1} (later ones are for evaluation), got {seed}.",
         )
     return seed

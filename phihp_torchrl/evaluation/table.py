@@ -1,4 +1,4 @@
-"""Tables for Markdown: our returns beside the paper's."""
+"""Markdown tables of returns, beside those of the paper."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from phihp_torchrl.evaluation.published import PUBLISHED, TARGETS
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What was reached on a task, over seeds of training.
+    """The returns of a method on a task, over seeds of training.
 
     Args:
         task: name of the task.
         samples: real samples used.
         planner: mean return of each seed's planner; empty if it was not evaluated.
         actor: mean return of each seed's actor alone.
-        label: the paper's name of the method.
+        label: name of the method in the paper.
     """
 
     task: str
@@ -28,9 +28,9 @@ class TaskResult:
 
 
 def returns_table(results: Iterable[TaskResult]) -> str:
-    """A row for each result, mean ± std over seeds, beside the target and the published return.
+    """Make a table with a row for each result: mean ± std over seeds, target, published return.
 
-    Published returns are those of the result's own method; targets are PhIHP's.
+    Published returns are those of the result's method; targets are those of PhIHP.
 
     Examples:
         >>> print(returns_table([TaskResult("pendulum", 200, planner=(-190.0, -188.0))]))
@@ -85,7 +85,7 @@ def mean_and_std(values: Sequence[float], digits: int = 1) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table, the first column left-aligned, the others right.
+    """Make a Markdown table with the first column left-aligned and the others right-aligned.
 
     Raises:
         ValueError: for a row of another length than the header.

@@ -21,28 +21,39 @@ def write_gif(
     size: int = 240,
     max_bytes: int = 1_000_000,
 ) -> Path:
-    """Write the pictures of a rendered episode, played in real time (20 frames a second at most).
+    """Write the pictures of an episode as a GIF in real time, with at most 20 frames a second.
 
-    A file that would be too large gets fewer frames for each second, and then smaller ones.
+    If the file would be too large, it gets fewer frames for each second, and then smaller ones.
 
     Args:
-        episode: from :func:`~phihp_torchrl.evaluation.play_episode` with ``render=True``.
-        path: file to write; its directory is made.
-        size: height in pixels; the width keeps the pictures' shape.
-        max_bytes: size of the file at most.
+        episode: an episode of :func:`~phihp_torchrl.evaluation.play_episode` with ``render=True``.
+        path: the file to write; its directory is made if absent.
+        size: height in pixels; the width keeps the shape of the pictures.
+        max_bytes: largest size of the file.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: if the episode was not rendered, or it can not be made small enough.
+        ValueError: if the episode has no pictures, or the GIF cannot be made small enough.
+
+    Examples:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from phihp_torchrl import get_task
+        >>> steps = np.zeros((3, 2)), np.zeros((2, 1)), np.zeros(2)
+        >>> frames = np.zeros((3, 40, 40, 3), dtype=np.uint8)
+        >>> episode = Episode(get_task("pendulum"), *steps, False, frames, frame_steps=1)
+        >>> with tempfile.TemporaryDirectory() as place:
+        ...     write_gif(episode, f"{place}/episode.gif", size=20).read_bytes()[:6]
+        b'GIF89a'
     """
     if not len(episode.frames):
         raise ValueError("episode: expected pictures, got none; play it with render=True.")
     if size < 16:
         raise ValueError(f"size: expected at least 16 pixels, got {size}.")
     duration = 1000.0 * episode.frame_steps * episode.task.time_step
-    # A world of long steps (Acrobot: 0.2 s) is shown faster than it is.
+    # A task with long time steps (Acrobot: 0.2 s) is shown faster than in real time.
     duration = min(duration, 50.0)
     stride, height = 1, size
     while True:

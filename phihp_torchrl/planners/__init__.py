@@ -1,28 +1,27 @@
-"""Acting: planning in the model, the policy as a prior and Q beyond the horizon."""
+"""Planners: search in the model, guided by the policy, with Q beyond the horizon (section 4.3)."""
 
 from __future__ import annotations
 
-from phihp_torchrl.planners.cem import CEMPlanner
-from phihp_torchrl.planners.core import plan
-from phihp_torchrl.planners.mppi import MPPIPlanner
-from phihp_torchrl.planners.mppi_core import MPPINoise, MPPIPlan, mppi_plan
-from phihp_torchrl.planners.pool import Plan
-from phihp_torchrl.planners.scoring import ActionBounds, Problem, TensorModel, score_sequences
-from phihp_torchrl.planners.settings import MPPISettings, PlanSettings, SearchSettings
+from phihp_torchrl.planners.candidates import Plan
+from phihp_torchrl.planners.cem import CEMConfig, cem_plan
+from phihp_torchrl.planners.cem_planner import CEMPlanner
+from phihp_torchrl.planners.mppi import MPPIConfig, MPPINoise, MPPIPlan, mppi_plan
+from phihp_torchrl.planners.mppi_planner import MPPIPlanner
+from phihp_torchrl.planners.problem import Problem, TensorModel, score_sequences
+from phihp_torchrl.planners.registry import PLANNERS, PlannerKind, make_planner, register_planner
+from phihp_torchrl.planners.sampling_planner import SamplingPlanner
+from phihp_torchrl.planners.search import SearchConfig
 
 __all__ = [
-    "ActionBounds",
+    "CEMConfig",
     "CEMPlanner",
-    "MPPINoise",
-    "MPPIPlan",
+    "MPPIConfig",
     "MPPIPlanner",
-    "MPPISettings",
-    "Plan",
-    "PlanSettings",
     "Problem",
-    "SearchSettings",
-    "TensorModel",
+    "SamplingPlanner",
+    "SearchConfig",
+    "cem_plan",
+    "make_planner",
     "mppi_plan",
-    "plan",
-    "score_sequences",
+    "register_planner",
 ]

@@ -1,4 +1,4 @@
-"""A TorchRL environment as the model of a plan: its keys, its bounds, its steps."""
+"""A TorchRL environment as the model of a plan: its keys, bounds and steps."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from torchrl.envs.utils import step_mdp
 
 
 class EnvModel:
-    """A stateless TorchRL environment in the place of a tensor model: states are tensordicts.
+    """A stateless TorchRL environment with the interface of a tensor model; states are tensordicts.
 
-    It steps without ever resetting: sequences that ended go on, and do not count any more.
+    It is never reset: sequences whose episode has ended are stepped further, but their rewards no
+    longer count.
 
     Args:
         env: the environment, of batch size ``[]``.
-        action_key: its action.
+        action_key: key of the action.
         action_shape: shape of one action.
-        reward_key: where a step leaves the reward, with the leading ``"next"``.
-        done_keys: where a step leaves that nothing follows, with the leading ``"next"``.
+        reward_key: key of the reward after a step, with the leading ``"next"``.
+        done_keys: keys of the flags that end a sequence, with the leading ``"next"``.
     """
 
     def __init__(
@@ -40,17 +41,17 @@ class EnvModel:
         self.done_keys = tuple(done_keys)
 
     def locate(self, observation: TensorDictBase) -> TensorDictBase:
-        """What the environment needs to step is what was observed."""
+        """Return the observation, from which the environment can be stepped."""
         return observation
 
     def observe(self, state: TensorDictBase) -> TensorDictBase:
-        """Actor and critic read their own keys."""
+        """Return the state, from which actor and critic read their keys."""
         return state
 
     def transition(
         self, state: TensorDictBase, action: Tensor
     ) -> tuple[TensorDictBase, Tensor, Tensor]:
-        """One step of the environment, ``[rows]``."""
+        """Step the environment, ``[rows]``."""
         state = state.copy().set(self.action_key, action.reshape(-1, *self.action_shape))
         state = self.env.step(state)
         reward = state.get(self.reward_key).reshape(-1)
@@ -67,7 +68,7 @@ class EnvModel:
 
 
 def find_action(env: EnvBase, key: NestedKey) -> TensorSpec:
-    """The spec of the one continuous action ``key``, without the batch."""
+    """Return the spec of the only, continuous action ``key``, without the batch size."""
     keys = [unravel_key(k) for k in env.action_keys]
     if keys != [key]:
         raise ValueError(f"action_key: expected the only action of {keys}, got {key!r}.")
@@ -78,7 +79,7 @@ def find_action(env: EnvBase, key: NestedKey) -> TensorSpec:
 
 
 def find_limits(spec: TensorSpec) -> tuple[Tensor, Tensor]:
-    """The bounds ``[m]`` of an action, infinite where there are none."""
+    """Return the bounds ``[m]`` of an action, infinite where there are none."""
     shape = spec.shape
     if isinstance(spec, Bounded):
         limits = (spec.space.low.expand(shape), spec.space.high.expand(shape))
@@ -89,7 +90,7 @@ def find_limits(spec: TensorSpec) -> tuple[Tensor, Tensor]:
 
 
 def find_reward(env: EnvBase, key: NestedKey) -> NestedKey:
-    """``key``, with the leading ``"next"``, if it is a reward of one number."""
+    """Return ``key``, with the leading ``"next"``, if it is the key of a scalar reward."""
     keys = [unravel_key(("next", k)) for k in env.reward_keys]
     if key not in keys:
         raise ValueError(f"reward_key: expected one of {keys}, got {key!r}.")
@@ -100,7 +101,7 @@ def find_reward(env: EnvBase, key: NestedKey) -> NestedKey:
 
 
 def find_done(env: EnvBase, keys: NestedKey | Sequence[NestedKey] | None) -> list[NestedKey]:
-    """The flags after which nothing counts, with the leading ``"next"``."""
+    """Return the keys of the flags that end a sequence, with the leading ``"next"``."""
     known = [unravel_key(("next", k)) for k in env.done_keys]
     if keys is None:
         return [key for key in known if key[-1] == "terminated"]
@@ -113,7 +114,7 @@ def find_done(env: EnvBase, keys: NestedKey | Sequence[NestedKey] | None) -> lis
 
 
 def find_situation(env: EnvBase) -> dict[NestedKey, TensorSpec]:
-    """All that an environment may be stepped from: its observations and what else is its state."""
+    """Return the specs of all keys from which an environment is stepped: observations and state."""
     specs: dict[NestedKey, TensorSpec] = {}
     for spec in (env.full_observation_spec_unbatched, env.full_state_spec_unbatched):
         for key in spec.keys(True, True):

@@ -1,130 +1,238 @@
-"""Planning by path integral control as a TorchRL module: observation in, action out."""
+"""Model-predictive path integral control guided by a policy: settings, and a pure plan function."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, exploration_type
 
-from phihp_torchrl.planners.base import SamplingPlanner
-from phihp_torchrl.planners.memory import PlanMemory
-from phihp_torchrl.planners.mppi_core import MPPINoise, MPPIPlan, mppi_plan
-from phihp_torchrl.planners.settings import MPPISettings
+from phihp_torchrl.config import ConfigError, check_choice, check_not_negative
+from phihp_torchrl.planners.candidates import BAD, Pool, fallback, score_pool, to_pool_layout
+from phihp_torchrl.planners.problem import Problem
+from phihp_torchrl.planners.search import SearchConfig
 
 
-class MPPIPlanner(SamplingPlanner):
-    """Plan with model-predictive path integral control and a policy as a prior, as TD-MPC does.
+@dataclass(frozen=True)
+class MPPIConfig(SearchConfig):
+    """Settings of an :class:`~phihp_torchrl.MPPIPlanner` (Hansen et al., 2022, section 3).
 
-    At each call sequences of the actor and Gaussian ones compete by imagined rewards and by Q
-    beyond the horizon, and the Gaussian is refitted to the elites, each weighted by the exponential
-    of its score. It starts from the previous plan's mean, shifted by a step. Under
-    ``set_exploration_type(ExplorationType.RANDOM)`` the action gets noise of the std that the
-    Gaussian has left; else it gets none.
-
-    It plans on whatever :class:`~phihp_torchrl.CEMPlanner` plans on, with the same keys and
-    backends, latent models included. :class:`torchrl.modules.MPPIPlanner` is another algorithm: it
-    weighs by a learned advantage, and knows neither an actor nor momentum nor elites by return.
-
-    References: https://arxiv.org/abs/2203.04955.
+    In every iteration the candidates are the actor's ``num_policy_candidates`` sequences and
+    ``num_candidates - num_policy_candidates`` new ones.
 
     Args:
-        env: the model to plan on, an environment of batch size ``[]``.
-        settings: the numbers; :attr:`settings` may be assigned anew, as schedules do.
-        options: ``actor``, ``qvalue``, keys, ``backend``, ``compile`` and ``generator`` of
-            :class:`~phihp_torchrl.planners.base.SamplingPlanner`. Each horizon compiles anew.
+        min_std: lower limit of the refitted std, in units of the action's half-range.
+        temperature: factor on the score in the weight of an elite, exp(temperature * score).
+        momentum: share of the previous mean in the new mean.
+        select: whether to act with an elite drawn by its weight (sample) or with the mean (mean).
 
     Raises:
-        ValueError: for an argument out of range or a key that is not there; when planning, for an
-            observation that is missing, not finite, or of the wrong shape, dtype or device.
+        ConfigError: for a value out of range; the message names the field.
 
     Examples:
-        >>> from tensordict import TensorDict
-        >>> from phihp_torchrl import HybridDynamics, WorldModelEnv, get_task
-        >>> from phihp_torchrl.dynamics import TaskWorldModel
-        >>> task = get_task("pendulum")
-        >>> env = WorldModelEnv(TaskWorldModel(task, HybridDynamics.oracle(task)))
-        >>> settings = MPPISettings(num_candidates=64, top_k=8, num_policy_candidates=0)
-        >>> planner = MPPIPlanner(env, settings)
-        >>> observation = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 1.0]])
-        >>> planner(TensorDict(observation=observation, batch_size=[2]))["action"].shape
-        torch.Size([2, 1])
+        >>> MPPIConfig(momentum=1.0)
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: momentum: expected a number in [0, 1), got 1.0.
     """
 
-    settings: MPPISettings
-    memory: PlanMemory
+    kind: ClassVar[str] = "mppi"
 
-    def __init__(self, env: EnvBase, settings: MPPISettings, **options: Any) -> None:
-        memory = PlanMemory(replan_every=1, warm_start=True)
-        super().__init__(env, settings, mppi_plan, memory, **options)
-        self._built_in: MPPISettings | None = None
+    planning_horizon: int = 5
+    optim_steps: int = 4
+    num_candidates: int = 134
+    top_k: int = 16
+    num_policy_candidates: int = 6
+    policy_noise: float = 0.05
+    policy_noise_clip: float = 0.3
+    init_std: float = 2.0
+    min_std: float = 0.05
+    temperature: float = 0.5
+    momentum: float = 0.1
+    select: str = "sample"
 
-    def draw_noise(self, batch: Sequence[int]) -> MPPINoise:
-        """The randomness of one plan for observations of this batch size."""
-        s, action_dim = self.settings, self._action_low.numel()
-        guided = s.num_policy_candidates
-        low = self._action_low
-        return MPPINoise(
-            samples=self._draw(
-                s.optim_steps, s.planning_horizon, s.num_candidates - guided, *batch, action_dim
-            ),
-            policy=self._draw(s.planning_horizon, guided, *batch, action_dim),
-            choice=torch.rand(
-                (s.top_k, *batch), generator=self.generator, dtype=low.dtype, device=low.device
-            ),
-        )
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.num_policy_candidates == self.num_candidates:
+            raise ConfigError(
+                "num_policy_candidates",
+                f"expected fewer than num_candidates = {self.num_candidates}, "
+                f"got {self.num_policy_candidates}.",
+            )
+        if self.min_std > self.init_std:
+            raise ConfigError(
+                "min_std", f"expected at most init_std = {self.init_std}, got {self.min_std}."
+            )
+        check_not_negative(self, "temperature")
+        if not 0 <= self.momentum < 1:
+            raise ConfigError("momentum", f"expected a number in [0, 1), got {self.momentum!r}.")
+        check_choice(self, "select", ("sample", "mean"))
 
-    @torch.no_grad()
-    def planning(self, tensordict: TensorDictBase, noise: MPPINoise | None = None) -> Tensor:
-        """Plan from ``tensordict`` and remember the plan's mean.
 
-        Args:
-            tensordict: the observations, of any batch size.
-            noise: the randomness of the plan. Drawn if absent.
+class MPPINoise(NamedTuple):
+    """All random numbers of a plan, drawn outside the compiled function so that seeds reproduce."""
 
-        Returns:
-            The action ``[*batch, *action_shape]``.
-        """
-        batch = tensordict.batch_size
-        cold = self.bounds.center.expand(*batch, self.settings.planning_horizon, -1)
-        mean = self.memory.recall(self._starts(tensordict), cold)
-        found = self.plan(tensordict, noise, mean)
-        self.memory.remember(found.mean)
-        action = found.actions[..., 0, :]
-        if exploration_type() is ExplorationType.RANDOM:
-            std = found.std[..., 0, :]
-            action = self.bounds.clip(action + std * self._draw(*std.shape))
-        return action.reshape(*batch, *self.action_spec.shape)
+    samples: Tensor
+    """Noise of the random candidates, standard normal, ``[I, H, N_rand, *batch, m]``."""
+    policy: Tensor
+    """Noise on the actor's candidates, standard normal, ``[H, N_pi, *batch, m]``."""
+    choice: Tensor
+    """Random numbers that choose the elite to act with, uniform in [0, 1), ``[K, *batch]``."""
 
-    @torch.no_grad()
-    def plan(
-        self,
-        tensordict: TensorDictBase,
-        noise: MPPINoise | None = None,
-        mean: Tensor | None = None,
-    ) -> MPPIPlan:
-        """The whole plan; remembers nothing.
 
-        Args:
-            tensordict: the observations, of any batch size.
-            noise: the randomness. Drawn if absent.
-            mean: center of the first random candidates, ``[*batch, H, m]``. Defaults to the middle
-                of the bounds.
-        """
-        self._check_observation(tensordict)
-        # The horizon and the floor of the std are arguments of the plan; the rest is built in.
-        fixed = replace(self.settings, planning_horizon=1, min_std=0.0)
-        if fixed != self._built_in:
-            self._built_in, self._planning_functions = fixed, {}
-        if noise is None:
-            noise = self.draw_noise(tensordict.batch_size)
-        # A tensor, and not the setting itself: a schedule would compile at every step.
-        min_std = torch.tensor(
-            self.settings.min_std, dtype=self._action_low.dtype, device=self._action_low.device
-        )
-        return self._call_plan(tensordict, noise, mean, min_std)
+class MPPIPlan(NamedTuple):
+    """The result of planning with MPPI; all but the score are ``[*batch, H, m]``."""
+
+    actions: Tensor
+    """The chosen action sequence, in bounds."""
+    mean: Tensor
+    """Mean of the last Gaussian, from which the next plan can start."""
+    std: Tensor
+    """Std of the last Gaussian, in physical units; that of the first action is for exploration."""
+    score: Tensor
+    """Score of the best candidate of the last iteration, ``[*batch]``; -inf if none is finite."""
+
+
+def mppi_plan(
+    observation: Any,
+    noise: MPPINoise,
+    mean: Tensor | None,
+    min_std: Tensor,
+    *,
+    problem: Problem,
+    settings: MPPIConfig,
+) -> MPPIPlan:
+    r"""Plan as TD-MPC does (Hansen et al., 2022, arXiv:2203.04955, section 3 and algorithm 1).
+
+    The candidates of an iteration are ``N_rand`` sequences from a Gaussian and ``N_pi`` of the
+    actor. The ``K`` elites :math:`\Gamma_i` of score :math:`\phi_i` define the next Gaussian:
+
+    .. math::
+        \Omega_i = e^{\tau(\phi_i - \max_j \phi_j)}, \quad
+        \mu \leftarrow \beta\mu + (1-\beta) \frac{\sum_i \Omega_i \Gamma_i}{\sum_i \Omega_i}, \quad
+        \sigma \leftarrow \mathrm{clip}\Big(
+        \sqrt{\tfrac{\sum_i \Omega_i (\Gamma_i - \hat\mu)^2}{\sum_i \Omega_i}},
+        \sigma_{min}, \sigma_{init}\Big)
+
+    with :math:`\hat\mu` the weighted mean, momentum :math:`\beta` and temperature :math:`\tau`. A
+    candidate whose score is not finite is never chosen; if no score is finite, the result is the
+    actor's sequence, or the mean without an actor. The function draws no random numbers, and the
+    rows of a batch are independent.
+
+    Args:
+        observation: observations to plan from, ``[*batch, o]``.
+        noise: random numbers of the plan; their shape sets the horizon.
+        mean: center of the first candidates, ``[*batch, H, m]``; ``None`` for the middle of the
+            bounds.
+        min_std: lower limit of the std, in units of the half-range, a scalar. It is a separate
+            argument so that a schedule needs to compile only once.
+        problem: model, bounds, actor and value.
+        settings: settings of the search.
+
+    Returns:
+        The chosen action sequence, the last Gaussian and the score.
+
+    Examples:
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> from phihp_torchrl.dynamics import TaskWorldModel
+        >>> task = get_task("pendulum")
+        >>> problem = Problem(TaskWorldModel(task, HybridDynamics.hybrid(task)), task.bounds)
+        >>> settings = MPPIConfig(num_candidates=16, top_k=4, num_policy_candidates=0)
+        >>> noise = MPPINoise(
+        ...     samples=torch.randn(4, 5, 16, 3, 1),
+        ...     policy=torch.zeros(5, 0, 3, 1),
+        ...     choice=torch.rand(4, 3),
+        ... )
+        >>> observation, min_std = task.observe(torch.zeros(3, 2)), torch.tensor(0.05)
+        >>> plan = mppi_plan(observation, noise, None, min_std, problem=problem, settings=settings)
+        >>> plan.actions.shape, bool((plan.std >= 0.1).all())  # the half-range is 2 N·m
+        (torch.Size([3, 5, 1]), True)
+    """
+    s, bounds = settings, problem.bounds
+    horizon, action_dim = noise.samples.shape[1], noise.samples.shape[-1]
+    batch = noise.samples.shape[3:-1]
+    samples = noise.samples.flatten(3, -2) if batch else noise.samples.unsqueeze(3)
+    rows = samples.shape[3]
+    state = problem.model.locate(observation)
+    state = state.reshape(-1, *state.shape[len(batch) :])
+
+    center = bounds.center.expand(horizon, 1, rows, action_dim)
+    center = center if mean is None else to_pool_layout(mean, rows)
+    limits = (min_std * bounds.scale, s.init_std * bounds.scale)
+    std = limits[1].expand(center.shape)
+
+    guided = None
+    if s.num_policy_candidates:
+        policy_noise = noise.policy.reshape(horizon, -1, rows, action_dim)
+        guided = _policy_candidates(state, policy_noise, problem, s)
+    rescue = fallback(state, None if guided is None else guided.first(1), center, problem)
+    for iteration_noise in samples.unbind(0):
+        pool = score_pool(state, bounds.clip(center + std * iteration_noise), problem, s)
+        if guided is not None:  # their scores are known, since the model is deterministic
+            pool = Pool(
+                torch.cat([guided.actions, pool.actions], 1),
+                torch.cat([guided.scores, pool.scores], 0),
+            )
+        elites, _ = pool.best(s.top_k)
+        weights = elite_weights(elites.scores, s.temperature)
+        center, std = _refit(elites, weights, center, std, limits, s.momentum)
+
+    if s.select == "sample":
+        # With E_i exponential, the smallest of E_i / w_i is that of i with probability w_i.
+        exponential = -torch.log1p(-noise.choice.reshape(s.top_k, rows))
+        race = exponential.clamp_min(torch.finfo(weights.dtype).tiny) / weights
+        index = race.argmin(0)[None, None, :, None].expand(horizon, 1, rows, action_dim)
+        actions = elites.actions.gather(1, index)
+    else:
+        actions = bounds.clip(center)
+    score = elites.scores[0]
+    actions = torch.where((score > BAD)[None, None, :, None], actions, rescue)
+    return MPPIPlan(
+        actions=_to_batch(actions, batch),
+        mean=_to_batch(center, batch),
+        std=_to_batch(std, batch),
+        score=score.reshape(batch),
+    )
+
+
+def elite_weights(scores: Tensor, temperature: float) -> Tensor:
+    """Return weights of elites ``[K, B]``, which sum to one; equal if no score is finite."""
+    best, good = scores[:1], scores > BAD
+    logits = torch.where(good, temperature * (scores - best), BAD)
+    return torch.where(good[:1], logits, torch.zeros_like(logits)).softmax(0)
+
+
+def _policy_candidates(state: Any, noise: Tensor, problem: Problem, settings: MPPIConfig) -> Pool:
+    """Score the actor's sequences, the noise-free one first; ``noise`` is ``[H, N_pi, B, m]``."""
+    limit = settings.policy_noise_clip
+    noise = (settings.policy_noise * noise).clamp(-limit, limit) * problem.bounds.scale
+    noise = torch.cat([torch.zeros_like(noise[:, :1]), noise[:, 1:]], 1)
+    return score_pool(state, torch.zeros_like(noise), problem, settings, noise)
+
+
+def _refit(
+    elites: Pool,
+    weights: Tensor,
+    center: Tensor,
+    std: Tensor,
+    limits: tuple[Tensor, Tensor],
+    momentum: float,
+) -> tuple[Tensor, Tensor]:
+    """Return the next mean and std, ``[H, 1, B, m]``; unchanged if no elite has a finite score."""
+    good = (elites.scores > BAD)[None, ..., None]
+    # An elite without a finite score has no weight, but its actions may be non-finite.
+    actions = torch.where(good, elites.actions, torch.zeros_like(elites.actions))
+    share = weights[None, ..., None]
+    mean = (share * actions).sum(1, keepdim=True)
+    variance = (share * (actions - mean).square()).sum(1, keepdim=True)
+    new_std = variance.sqrt().clamp(*limits)
+    new_center = momentum * center + (1.0 - momentum) * mean
+    any_good = good[:, :1]
+    return torch.where(any_good, new_center, center), torch.where(any_good, new_std, std)
+
+
+def _to_batch(sequences: Tensor, batch: torch.Size) -> Tensor:
+    """Rearrange sequences from ``[H, 1, B, m]`` to ``[*batch, H, m]``."""
+    sequences = sequences[:, 0].transpose(0, 1)
+    return sequences.reshape(*batch, *sequences.shape[1:])

@@ -1,4 +1,4 @@
-"""Sequences that compete in a plan: how they are laid out, scored and picked."""
+"""Candidate action sequences of a plan: their layout, scoring and selection."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from phihp_torchrl.planners.scoring import Problem, score_sequences
-from phihp_torchrl.planners.settings import SearchSettings
+from phihp_torchrl.planners.problem import Problem, score_sequences
+from phihp_torchrl.planners.search import SearchConfig
 
-# In here a batch is one dim, B, and comes after the candidates: sequences are [H, N, B, m], so that
-# the actions of a step, and those of the actor's candidates among them, are contiguous rows.
+# In this module the batch is one dimension, B, after the candidates: sequences are [H, N, B, m], so
+# that the actions of one step, and among them those of the actor's candidates, are contiguous rows.
 BAD = float("-inf")
 
 
 class Plan(NamedTuple):
-    """What planning returns.
+    """The result of planning with CEM.
 
     Attributes:
-        actions: the sequence to act with, ``[*batch, H, m]``, in bounds.
-        score: its score ``[*batch]``; where a mean was not scored itself, that of the best sequence
-            met; -inf where no candidate had a finite score.
+        actions: the chosen action sequence, ``[*batch, H, m]``, in bounds.
+        score: its score ``[*batch]``; for a mean that was not scored, the score of the best
+            candidate; -inf where no candidate had a finite score.
     """
 
     actions: Tensor
@@ -35,11 +35,11 @@ class Pool(NamedTuple):
     scores: Tensor
 
     def first(self, count: int) -> Pool:
-        """The first ``count`` of them."""
+        """Return the first ``count`` sequences."""
         return Pool(self.actions[:, :count], self.scores[:count])
 
     def best(self, count: int) -> tuple[Pool, Tensor]:
-        """The ``count`` best of each row, best first, and where they were, ``[count, B]``."""
+        """Return the ``count`` best sequences of each row, best first, and their indices."""
         scores, index = self.scores.topk(count, dim=0)
         gather_index = index[None, ..., None].expand(
             self.actions.shape[0], -1, -1, self.actions.shape[-1]
@@ -47,7 +47,7 @@ class Pool(NamedTuple):
         return Pool(self.actions.gather(1, gather_index), scores), index
 
     def where(self, condition: Tensor, other: Pool) -> Pool:
-        """These where ``condition`` ``[N, B]`` holds, else those of ``other``."""
+        """Return these sequences where ``condition`` ``[N, B]`` holds, and those of ``other``."""
         return Pool(
             torch.where(condition[None, ..., None], self.actions, other.actions),
             torch.where(condition, self.scores, other.scores),
@@ -55,7 +55,7 @@ class Pool(NamedTuple):
 
 
 def to_pool_layout(sequences: Tensor, rows: int) -> Tensor:
-    """``[*batch, H, m] -> [H, 1, B, m]``."""
+    """Rearrange sequences from ``[*batch, H, m]`` to ``[H, 1, B, m]``."""
     return sequences.reshape(rows, *sequences.shape[-2:]).transpose(0, 1).unsqueeze(1)
 
 
@@ -63,10 +63,19 @@ def score_pool(
     state: Any,
     actions: Tensor,
     problem: Problem,
-    settings: SearchSettings,
+    settings: SearchConfig,
     policy_noise: Tensor | None = None,
 ) -> Pool:
-    """Score sequences ``[H, N, B, m]`` from the states ``[B, n]``; the first may be the actor's."""
+    """Score sequences ``[H, N, B, m]`` from states ``[B, n]``.
+
+    Args:
+        state: first states.
+        actions: the sequences.
+        problem: model, bounds, actor and value.
+        settings: the settings of the search.
+        policy_noise: noise ``[H, N_pi, B, m]`` on the actor's actions, which then replace the first
+            ``N_pi`` sequences.
+    """
     shape = actions.shape
     repeated = state.expand(shape[1], *state.shape).reshape(-1, *state.shape[1:])
     scores, actions = score_sequences(
@@ -82,7 +91,7 @@ def score_pool(
 
 
 def fallback(state: Any, own: Pool | None, center: Tensor, problem: Problem) -> Tensor:
-    """What to do where every score is bad, ``[H, 1, B, m]``: the actor's, else the center."""
+    """The plan if no score is finite, ``[H, 1, B, m]``: the actor's actions, or the center."""
     if problem.actor is None:
         return center
     if own is not None:

@@ -58,7 +58,7 @@ class TensorPrioritizedSliceSampler(PrioritizedSliceSampler):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
+        """Continue from a :meth:`state_dict`."""
         self._sum_tree.values.copy_(state_dict["priorities"])
         highest = state_dict["max_priority"]
         self._set_max_priority(None if highest is None else torch.tensor(highest))
@@ -66,7 +66,7 @@ class TensorPrioritizedSliceSampler(PrioritizedSliceSampler):
 
 
 class _Sums:
-    """What the sampler asks of a tree of sums, of one tensor."""
+    """One tensor with the interface of the sampler's tree of sums."""
 
     def __init__(self, values: Tensor) -> None:
         self.values = values
@@ -92,7 +92,7 @@ class _Sums:
 
 
 class _Minima:
-    """What the sampler asks of a tree of minima, of the same tensor: those that can be drawn."""
+    """The same tensor with the interface of the sampler's tree of minima."""
 
     def __init__(self, values: Tensor) -> None:
         self.values = values

@@ -10,26 +10,35 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torchrl.modules import MLP
 
-from phihp_torchrl.ranges import check_count
-from phihp_torchrl.tasks import Task
+from phihp_torchrl.config import ConfigError, check_count
+from phihp_torchrl.tasks import ActionBounds, Task
+
+_WIDEST = 65_536
+"""The largest width of a layer, so that a hostile file cannot ask for all memory."""
 
 
 @dataclass(frozen=True)
 class TOLDConfig:
-    """Sizes of :class:`TOLD`; the values are the published ones, for observations of a state.
+    """Sizes of :class:`TOLD`, for observations of a state.
 
     Args:
         latent_dim: components of the latent.
-        encoder_dim: width of the encoder's one hidden layer.
+        encoder_dim: width of the encoder's hidden layer.
         mlp_dim: width of both hidden layers of every other network.
+
+    Raises:
+        ConfigError: for a value out of range, by its name.
     """
 
     latent_dim: int = 50
-    encoder_dim: int = 256
-    mlp_dim: int = 512
+    encoder_dim: int = 128
+    mlp_dim: int = 128
 
     def __post_init__(self) -> None:
         check_count(self, "latent_dim", "encoder_dim", "mlp_dim")
+        for name, value in vars(self).items():
+            if value > _WIDEST:
+                raise ConfigError(name, f"expected at most {_WIDEST}, got {value}.")
 
 
 class TOLD(nn.Module):
@@ -39,12 +48,12 @@ class TOLD(nn.Module):
         z_t = h(o_t), \quad z_{t+1} = d(z_t, a_t), \quad \hat r_t = R(z_t, a_t), \quad
         \hat q_t = Q_j(z_t, a_t), \quad \hat a_t = \pi(z_t)
 
-    It is a :class:`~phihp_torchrl.planners.TensorModel` of latents, so planners plan in it: what a
-    latent is located from, and what is observed of it, is the latent itself. Actions are in
-    physical units outside, and scaled to [-1, 1] for the networks.
+    It has the methods of a model for planners (``locate``, ``observe``, ``transition``), in which
+    the latent is both the state and the observation. Actions are in physical units; the networks
+    read them scaled to [-1, 1].
 
-    Where episodes can terminate, a sixth network tells from a latent whether they did. The
-    publication knows no terminations.
+    If episodes can terminate, a sixth network predicts from a latent whether they have. The
+    publication has no terminations.
 
     The weights start orthogonal and the biases at zero; the last layers of reward and Q are zero.
 
@@ -52,12 +61,12 @@ class TOLD(nn.Module):
 
     Args:
         observation_dim: components of an observation, ``o``.
-        action_high: bounds of the action in physical units, ``m`` of them.
+        bounds: bounds of the action in physical units, ``[m]``.
         config: sizes.
         terminates: whether episodes can terminate.
 
     Examples:
-        >>> told = TOLD(3, [2.0])
+        >>> told = TOLD(3, ActionBounds.from_limits([-2.0], [2.0]))
         >>> latent = told.encode(torch.zeros(8, 3))
         >>> next_latent, reward, terminated = told.transition(latent, torch.zeros(8, 1))
         >>> next_latent.shape, reward.shape
@@ -66,19 +75,22 @@ class TOLD(nn.Module):
         torch.Size([2, 8])
     """
 
-    action_high: Tensor
+    low: Tensor
+    high: Tensor
+    center: Tensor
+    scale: Tensor
 
     def __init__(
         self,
         observation_dim: int,
-        action_high: Sequence[float],
+        bounds: ActionBounds,
         config: TOLDConfig | None = None,
         *,
         terminates: bool = False,
     ) -> None:
         super().__init__()
         self.config = config = config or TOLDConfig()
-        latent, action = config.latent_dim, len(action_high)
+        latent, action = config.latent_dim, len(bounds.scale)
         self.encoder = _mlp(observation_dim, latent, [config.encoder_dim])
         hidden = [config.mlp_dim] * 2
         self.dynamics = _mlp(latent + action, latent, hidden)
@@ -86,7 +98,8 @@ class TOLD(nn.Module):
         self.critics = nn.ModuleList(_critic(latent + action, config.mlp_dim) for _ in range(2))
         self.actor = _mlp(latent, action, hidden)
         self.termination = _mlp(latent, 1, hidden) if terminates else None
-        self.register_buffer("action_high", torch.tensor(list(action_high)))
+        for name, limit in bounds._asdict().items():  # the task's, and no part of the weights
+            self.register_buffer(name, limit, persistent=False)
         self.apply(_orthogonal)
         for network in (self.reward, *self.critics):
             nn.init.zeros_(network[-1].weight)
@@ -95,11 +108,16 @@ class TOLD(nn.Module):
     def for_task(cls, task: Task, config: TOLDConfig | None = None) -> TOLD:
         """The networks that a task wants, untrained."""
         return cls(
-            task.system.observation_dim,
-            task.action_high,
+            task.observation_dim,
+            task.bounds,
             config,
             terminates=task.terminated is not None,
         )
+
+    @property
+    def bounds(self) -> ActionBounds:
+        """The action's bounds, where the networks are."""
+        return ActionBounds(self.low, self.high, self.center, self.scale)
 
     def encode(self, observation: Tensor) -> Tensor:
         """Observation ``[*batch, o]`` -> latent ``[*batch, l]``."""
@@ -131,7 +149,7 @@ class TOLD(nn.Module):
 
         Args:
             latent: ``[*batch, l]``.
-            noise: added to the action, in units of its bounds, ``[*batch, m]``.
+            noise: added to the action, in units of its half-range, ``[*batch, m]``.
         """
         return self.squash(self.actor(latent), noise)
 
@@ -144,7 +162,7 @@ class TOLD(nn.Module):
         if noise is not None:
             clipped = (action + noise).clamp(-1.0, 1.0)
             action = clipped.detach() + (action - action.detach())
-        return action * self.action_high
+        return self.bounds.from_unit(action)
 
     def termination_logit(self, latent: Tensor) -> Tensor | None:
         """Logit ``[*batch]`` of having terminated in ``latent``; ``None`` if that never happens."""
@@ -168,7 +186,7 @@ class TOLD(nn.Module):
         return next_latent, reward, terminated
 
     def _inputs(self, latent: Tensor, action: Tensor) -> Tensor:
-        return torch.cat([latent, action / self.action_high], -1)
+        return torch.cat([latent, self.bounds.to_unit(action)], -1)
 
 
 def _mlp(in_features: int, out_features: int, hidden: Sequence[int]) -> MLP:

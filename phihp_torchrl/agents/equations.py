@@ -1,71 +1,61 @@
 """TD3's equations as pure functions on tensors (Fujimoto et al., 2018, arXiv:1802.09477).
 
 Everything here compiles into one graph. Networks are flat sequences of tensors ``(weight, bias,
-weight, bias, …)``; those of the critics carry a leading dimension, one entry a critic, as
+weight, bias, …)``; those of the critics have a leading dimension of one entry for each critic, as
 :class:`torchrl.objectives.TD3Loss` stacks them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from phihp_torchrl.imagination import Batch, Transit, finite_transition
+from phihp_torchrl.tasks import ActionBounds
+
 Layers = Sequence[Tensor]
-Transition = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
-"""``state, action -> next_state, reward, terminated`` (see ``TaskWorldModel.transition``)."""
-
-
-class Batch(NamedTuple):
-    """Transitions, one a row."""
-
-    state: Tensor
-    """``[N, n]``."""
-    action: Tensor
-    """Physical units, ``[N, m]``."""
-    reward: Tensor
-    """``[N]``."""
-    next_state: Tensor
-    """``[N, n]``."""
-    terminated: Tensor
-    """bool ``[N]``."""
 
 
 def mlp(layers: Layers, inputs: Tensor) -> Tensor:
-    """A network with ReLU between its layers, ``[N, in] -> [N, out]``."""
+    """Evaluate a network with ReLU between its layers, ``[N, in] -> [N, out]``."""
     for i in range(0, len(layers) - 2, 2):
         inputs = F.linear(inputs, layers[i], layers[i + 1]).relu()
     if torch.is_autocast_enabled(inputs.device.type):
-        # The rest in half the precision would round a value of hundreds to whole numbers.
+        # In bfloat16 the last layer would round a value of hundreds to whole numbers.
         with torch.autocast(inputs.device.type, enabled=False):
             return F.linear(inputs.to(layers[-2].dtype), layers[-2], layers[-1])
     return F.linear(inputs, layers[-2], layers[-1])
 
 
-def policy(actor: Layers, observation: Tensor, action_high: Tensor) -> Tensor:
-    """The actor: ``[N, o] -> [N, m]``, physical units."""
-    return mlp(actor, observation).tanh() * action_high
+def act(actor: Layers, observation: Tensor, bounds: ActionBounds) -> Tensor:
+    """Evaluate the actor's layers: observations ``[N, o]`` to actions ``[N, m]`` in bounds.
+
+    Args:
+        actor: layers of the actor, ``(weight, bias, …)``.
+        observation: observations ``[N, o]``.
+        bounds: bounds of the action.
+
+    Returns:
+        Actions in physical units.
+
+    Examples:
+        >>> layers = [torch.zeros(1, 3), torch.full((1,), 100.0)]
+        >>> bounds = ActionBounds.from_limits([0.0], [12.0])
+        >>> act(layers, torch.zeros(2, 3), bounds).flatten()
+        tensor([12., 12.])
+    """
+    return bounds.from_unit(mlp(actor, observation).tanh())
 
 
-def q_values(critics: Layers, observation: Tensor, action: Tensor, action_high: Tensor) -> Tensor:
-    """All critics: ``[N, o], [N, m] -> [critics, N]``."""
-    inputs = torch.cat([observation, action / action_high], -1)
-    # One by one: batched products are no faster at these sizes, and leave no room for fusion.
+def q_values(critics: Layers, observation: Tensor, action: Tensor, bounds: ActionBounds) -> Tensor:
+    """Evaluate all critics: observations ``[N, o]``, actions ``[N, m]`` to ``[critics, N]``."""
+    inputs = torch.cat([observation, bounds.to_unit(action)], -1)
+    # One critic at a time: batched products are not faster at these sizes, and prevent fusion.
     apart = zip(*(layer.unbind() for layer in critics), strict=True)
     return torch.stack([mlp(critic, inputs).squeeze(-1) for critic in apart])
-
-
-def finite_transition(
-    transition: Transition, state: Tensor, action: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """A step of the model; one into non-finite numbers stays put, earns nothing and terminates."""
-    next_state, reward, terminated = transition(state, action)
-    finite = next_state.isfinite().all(-1) & reward.isfinite()
-    next_state = torch.where(finite.unsqueeze(-1), next_state, state)
-    return next_state, torch.where(finite, reward, torch.zeros_like(reward)), terminated | ~finite
 
 
 def td3_target(
@@ -73,27 +63,27 @@ def td3_target(
     actor: Layers,
     critics: Layers,
     noise: Tensor,
-    action_high: Tensor,
+    bounds: ActionBounds,
     gamma: float,
     observe: Callable[[Tensor], Tensor],
-    transition: Transition | None = None,
+    transition: Transit | None = None,
     expansion: int = 1,
 ) -> Tensor:
-    r"""The value that the critics should have, ``[N]``.
+    r"""Compute the target of the critics, ``[N]``.
 
     .. math::
         y = \sum_{i<k} \gamma^i r_i + \gamma^k \min_j Q'_j(s_k, \mathrm{clip}(\pi'(s_k) + \epsilon))
 
-    with nothing after a termination. The first reward is the batch's; with ``expansion`` k > 1 the
-    model carries on for k - 1 steps under the target policy (model-based value expansion, Feinberg
-    et al., 2018, arXiv:1803.00101).
+    where rewards and values after a termination are 0. The first reward is that of the batch; with
+    ``expansion`` k > 1 the model continues for k - 1 steps under the target policy (model-based
+    value expansion, Feinberg et al., 2018, arXiv:1803.00101).
 
     Args:
         batch: transitions.
         actor: target actor.
         critics: target critics.
         noise: target policy noise, clipped, in physical units, ``[N, m]``.
-        action_high: action bounds ``[m]``.
+        bounds: the action's bounds.
         gamma: discount.
         observe: state -> observation.
         transition: the model, needed for ``expansion`` > 1.
@@ -109,47 +99,46 @@ def td3_target(
     for _ in range(expansion - 1):
         if transition is None:
             raise ValueError(f"transition: expected the model for expansion={expansion}, got none.")
-        action = policy(actor, observe(state), action_high)
+        action = act(actor, observe(state), bounds)
         state, reward, terminated = finite_transition(transition, state, action)
         value = value + discount * reward
         discount = gamma * discount * (1.0 - terminated.to(value.dtype))
     observation = observe(state)
-    action = policy(actor, observation, action_high) + noise
-    action = torch.minimum(torch.maximum(action, -action_high), action_high)
-    return value + discount * q_values(critics, observation, action, action_high).amin(0)
+    action = bounds.clip(act(actor, observation, bounds) + noise)
+    return value + discount * q_values(critics, observation, action, bounds).amin(0)
 
 
 def critic_loss(
-    critics: Layers, observation: Tensor, action: Tensor, target: Tensor, action_high: Tensor
+    critics: Layers, observation: Tensor, action: Tensor, target: Tensor, bounds: ActionBounds
 ) -> Tensor:
-    """Squared errors of all critics, summed over critics and averaged over the batch."""
-    error = q_values(critics, observation, action, action_high) - target
+    """The squared errors of the critics, summed over critics and averaged over the batch."""
+    error = q_values(critics, observation, action, bounds) - target
     return error.square().sum(0).mean()
 
 
-def actor_loss(actor: Layers, critics: Layers, observation: Tensor, action_high: Tensor) -> Tensor:
+def actor_loss(actor: Layers, critics: Layers, observation: Tensor, bounds: ActionBounds) -> Tensor:
     """-Q1(s, pi(s)), averaged over the batch."""
-    action = policy(actor, observation, action_high)
+    action = act(actor, observation, bounds)
     first = [layer[:1] for layer in critics]
-    return -q_values(first, observation, action, action_high).mean()
+    return -q_values(first, observation, action, bounds).mean()
 
 
 ADAM_BETAS = (0.9, 0.999)
-"""Decay of Adam's first and second moments."""
+"""Decay rates of Adam's first and second moments."""
 
 
 def adam_rates(step: Tensor, learning_rate: float, eps: float = 1e-8) -> tuple[Tensor, Tensor]:
-    """The two scalars of a step of Adam that do not depend on the gradient.
+    """Compute the two scalars of a step of Adam that do not depend on the gradient.
 
-    They are apart from :func:`adam_` to be computed once a step rather than once an element.
+    They are computed once a step, outside :func:`adam_`, rather than once for each tensor.
 
     Args:
         step: number of this step, from 1, any shape.
         learning_rate: learning rate.
-        eps: what :class:`torch.optim.Adam` adds to the denominator.
+        eps: the term that :class:`torch.optim.Adam` adds to the denominator.
 
     Returns:
-        Size of the step and what to add to the root of the second moment, float32.
+        The step size, and the term to add to the root of the second moment, both float32.
     """
     step = step.to(torch.float64)
     beta1, beta2 = ADAM_BETAS
@@ -161,10 +150,10 @@ def adam_rates(step: Tensor, learning_rate: float, eps: float = 1e-8) -> tuple[T
 def adam_(
     params: Layers, grads: Layers, means: Layers, squares: Layers, size: Tensor, eps: Tensor
 ) -> None:
-    """One step of Adam in place, as :class:`torch.optim.Adam` defines it.
+    """Take one step of Adam in place, as :class:`torch.optim.Adam` defines it.
 
     Args:
-        params: what to change.
+        params: parameters, changed in place.
         grads: gradients.
         means: first moments, changed in place.
         squares: second moments, changed in place.

@@ -1,4 +1,4 @@
-"""Actors and critics of TensorDict modules as the functions that a plan calls."""
+"""Actors and critics that are TensorDict modules, as functions of tensors for a plan."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from torch import Tensor
 
 
 def tensor_function(module: TensorDictModuleBase, out_key: NestedKey) -> Callable[..., Tensor]:
-    """What ``module`` computes for ``out_key``, as a function of the tensors of its ``in_keys``.
+    """Make a function of the tensors of ``module.in_keys`` that returns ``out_key``.
 
-    Plain :class:`~tensordict.nn.TensorDictModule` and sequences of them are called without a
-    tensordict, which takes much longer than a small network. Anything else is given one.
+    A plain :class:`~tensordict.nn.TensorDictModule` and sequences of them are called without a
+    tensordict, because making one takes much longer than a small network. Other modules are called
+    with a tensordict.
 
     Args:
         module: a module with one or several ``in_keys``.
@@ -68,7 +69,7 @@ def _has_hooks(module: torch.nn.Module) -> bool:
 def actor_function(
     module: TensorDictModuleBase, action_key: NestedKey, action_dim: int
 ) -> Callable[[Any], Tensor]:
-    """Observation, a tensor or a tensordict ``[rows]`` -> action ``[rows, m]``."""
+    """Make a function from observation (tensor or tensordict) to action ``[rows, m]``."""
     function, keys = tensor_function(module, action_key), list(module.in_keys)
 
     def act(observation: Any) -> Tensor:
@@ -84,7 +85,7 @@ def value_function(
     action_key: NestedKey,
     action_shape: torch.Size,
 ) -> Callable[[Any, Tensor], Tensor]:
-    """Observation, a tensor or a tensordict, and action ``[rows, m]`` -> min(Q1, Q2) ``[rows]``."""
+    """Make a function from observation and action ``[rows, m]`` to min(Q1, Q2) ``[rows]``."""
     function, keys = tensor_function(module, value_key), list(module.in_keys)
 
     def value(observation: Any, action: Tensor) -> Tensor:
@@ -96,7 +97,7 @@ def value_function(
 
 
 def smallest(values: Tensor) -> Tensor:
-    """min(Q1, Q2) ``[rows]`` of values ``[rows, critics]``, or stacked ``[critics, rows, 1]``."""
+    """Reduce values ``[rows, critics]`` or ``[critics, rows, 1]`` to the smallest, ``[rows]``."""
     return values.amin(-1) if values.ndim == 2 else values.squeeze(-1).amin(0)
 
 

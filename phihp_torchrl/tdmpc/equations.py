@@ -2,7 +2,7 @@
 
 Slices are ``[N, H, ...]``: ``N`` of them, each ``H`` transitions long. Transitions that come after
 the end of an episode are padding, finite but meaningless, and ``valid`` ``[N, H]`` is false there:
-they count nowhere.
+they do not enter any loss.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from phihp_torchrl.agents.tdmpc.told import TOLD
+from phihp_torchrl.tdmpc.networks import TOLD
 
 
 class Slices(NamedTuple):
@@ -46,7 +46,7 @@ class ModelLosses(NamedTuple):
 
 @torch.no_grad()
 def td_target(told: TOLD, target: TOLD, slices: Slices, noise: Tensor, gamma: float) -> Tensor:
-    r"""What the critics should say, ``[N, H]``.
+    r"""Compute the target of the critics, ``[N, H]``.
 
     .. math::
         y_t = r_t + \gamma\, (1 - \text{terminated}_t) \min_j Q^-_j(z_{t+1}, \pi(z_{t+1})),
@@ -58,7 +58,7 @@ def td_target(told: TOLD, target: TOLD, slices: Slices, noise: Tensor, gamma: fl
         told: the networks.
         target: their targets.
         slices: transitions.
-        noise: on the policy's action, in units of its bounds, ``[N, H, m]``.
+        noise: on the policy's action, in units of its half-range, ``[N, H, m]``.
         gamma: discount.
     """
     latent = told.encode(slices.next_observation)
@@ -134,7 +134,7 @@ def policy_loss(
     rho: float,
     output_penalty: float = 0.0,
 ) -> Tensor:
-    r"""How little the critics think of the policy, a scalar.
+    r"""Compute the loss of the policy, its negative value by the critics, a scalar.
 
     .. math::
         -\sum_{t=0}^{H} \rho^t \Big(\min_j Q_j(\bar z_t, \pi(\bar z_t))
@@ -147,7 +147,7 @@ def policy_loss(
         told: the networks.
         latents: ``[N, H + 1, l]``.
         slices: transitions.
-        noise: on the policy's action, in units of its bounds, ``[N, H + 1, m]``.
+        noise: on the policy's action, in units of its half-range, ``[N, H + 1, m]``.
         rho: temporal weight.
         output_penalty: weight :math:`c` of the outputs before tanh. Where tanh is flat the critics'
             gradients do not reach the policy any more; this brings it back. Not in the publication.

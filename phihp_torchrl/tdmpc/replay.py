@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase, pad
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from phihp_torchrl.agents.tdmpc.priorities import TensorPrioritizedSliceSampler
+from phihp_torchrl.tdmpc.sampler import TensorPrioritizedSliceSampler
 
 
 class EpisodeReplay:
@@ -24,7 +24,7 @@ class EpisodeReplay:
     :math:`(N p_i)^{-\beta}`, are divided by the greatest of them.
 
     Args:
-        capacity: transitions and padding kept; the oldest make room.
+        capacity: transitions kept, including padding; new ones replace the oldest.
         horizon: transitions in a slice.
         batch_size: slices in a batch.
         alpha: how much priorities count; 0 samples uniformly.
@@ -114,7 +114,7 @@ class EpisodeReplay:
         self.sampler.update_priority(slices["index"][:, 0].reshape(-1), priority)
 
     def state_dict(self) -> dict[str, Any]:
-        """All that sampling depends on but the generator; tensors and numbers."""
+        """Return the state of the buffer without the generator, as tensors and numbers."""
         storage = self.buffer.storage
         return {
             "rows": storage[:].to_dict() if len(storage) else {},
@@ -124,7 +124,7 @@ class EpisodeReplay:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
+        """Continue from a :meth:`state_dict`."""
         self.buffer.empty()
         if state["rows"]:
             self.buffer.extend(TensorDict(state["rows"]).auto_batch_size_(1))

@@ -1,4 +1,4 @@
-"""What planners that sample and refit share as TorchRL modules: keys, parts, backends, memory."""
+"""The base of planners that sample action sequences: keys, modules, backends, receding horizon."""
 
 from __future__ import annotations
 
@@ -25,52 +25,67 @@ from phihp_torchrl.planners.env_model import (
     find_reward,
     find_situation,
 )
-from phihp_torchrl.planners.functions import actor_function, value_function
-from phihp_torchrl.planners.memory import PlanMemory
-from phihp_torchrl.planners.scoring import ActionBounds, Problem, TensorModel
-from phihp_torchrl.planners.settings import SearchSettings
+from phihp_torchrl.planners.module_functions import actor_function, value_function
+from phihp_torchrl.planners.problem import Problem, TensorModel
+from phihp_torchrl.planners.receding_horizon import RecedingHorizon
+from phihp_torchrl.planners.search import SearchConfig
+from phihp_torchrl.tasks import ActionBounds
 
 _logger = logging.getLogger(__name__)
 
 
 class SamplingPlanner(MPCPlannerBase):
-    """A planner that scores sampled sequences in a model: all but the plan itself.
+    """The base of planners that score sampled action sequences in a model.
 
-    :class:`~phihp_torchrl.CEMPlanner` and :class:`~phihp_torchrl.planners.MPPIPlanner` are such.
+    :class:`~phihp_torchrl.CEMPlanner` and :class:`~phihp_torchrl.MPPIPlanner` extend it with their
+    plan functions. A planner of your own does the same, implements :meth:`planning`, and is
+    registered by :func:`~phihp_torchrl.register_planner`.
 
     Args:
-        env: the model to plan on, an environment of batch size ``[]``.
-        settings: the numbers of the search.
+        env: the environment to plan on, of batch size ``[]``.
+        settings: settings of the search.
         plan: the plan as a pure function, with ``problem`` and ``settings`` among its keywords.
-        memory: what carries over from one step to the next, or ``None``.
-        reward_key: where a step leaves the reward.
-        action_key: the action.
+        receding: the receding horizon, which keeps plans between steps, or ``None``.
+        reward_key: key of the reward after a step.
+        action_key: key of the action.
         actor: a module that writes ``action_key``, in physical units, or ``None``.
-        qvalue: a module that reads what the actor reads and the action, and writes ``value_key``;
-            of several values the smallest counts. Needs an actor.
-        observation_key: what the tensor model is given. Defaults to ``"observation"``, or the only
-            observation there is.
-        done_keys: after which flags of a step nothing counts any more. Defaults to all of the
-            environment's that end in ``"terminated"``.
-        value_key: what ``qvalue`` writes.
-        is_init_key: bool that is true where an episode starts (see
+        qvalue: a module that reads observation and action and writes ``value_key``; of several
+            values the smallest is used. Needs an actor.
+        observation_key: the observation that the tensor model reads. Defaults to
+            ``"observation"``, or to the only observation.
+        done_keys: keys of the flags after which rewards no longer count. Defaults to all keys of
+            the environment that end in ``"terminated"``.
+        value_key: the key that ``qvalue`` writes.
+        is_init_key: key of a bool that is true where an episode starts (see
             :class:`torchrl.envs.InitTracker`); without it, call :meth:`reset`.
-        backend: ``"tensor"``, ``"env"``, or ``"auto"`` for the first where it can be.
+        backend: ``"tensor"`` calls the environment's ``tensor_model``, ``"env"`` steps the
+            environment, and ``"auto"`` uses the tensor model if possible.
         compile: whether to compile the plan as one full graph; a dict is passed to
-            :func:`torch.compile`. Left out where the environment is stepped or does not compile.
-        generator: source of the noise, on the environment's device. Defaults to torch's global one.
+            :func:`torch.compile`. A plan that steps the environment, or whose model does not
+            compile, is not compiled, and a warning is logged.
+        generator: source of the noise, on the environment's device. Defaults to torch's global
+            generator.
 
     Raises:
-        ValueError: for an argument out of range or a key that is not there; when planning, for an
+        ValueError: for an argument out of range or an unknown key; when planning, for an
             observation that is missing, not finite, or of the wrong shape, dtype or device.
+
+    Examples:
+        >>> from phihp_torchrl import CEMPlanner, HybridDynamics, WorldModelEnv, get_task
+        >>> from phihp_torchrl.dynamics import TaskWorldModel
+        >>> task = get_task("pendulum")
+        >>> env = WorldModelEnv(TaskWorldModel(task, HybridDynamics.hybrid(task)))
+        >>> planner = CEMPlanner(env, 5, optim_steps=2, num_candidates=16, top_k=4)
+        >>> isinstance(planner, SamplingPlanner), planner.uses_tensors, planner.in_keys
+        (True, True, ['observation'])
     """
 
     def __init__(
         self,
         env: EnvBase,
-        settings: SearchSettings,
+        settings: SearchConfig,
         plan: Callable[..., Any],
-        memory: PlanMemory | None,
+        receding: RecedingHorizon | None,
         reward_key: NestedKey = ("next", "reward"),
         action_key: NestedKey = "action",
         *,
@@ -100,36 +115,36 @@ class SamplingPlanner(MPCPlannerBase):
         low, high = find_limits(action_spec)
         self.register_buffer("_action_low", low, persistent=False)
         self.register_buffer("_action_high", high, persistent=False)
-        self._bounds: ActionBounds | None = None  # made once from these, not for each action
-        self.memory = memory
+        self._bounds: ActionBounds | None = None  # computed once from these, not for each action
+        self.receding = receding
         self._choose_backend(backend, done_keys is None, bool(compile))
-        # A tensor model finds the state from one observation, on either path.
+        # With either backend, a tensor model computes the state from one observation.
         self.in_keys = list(situation)
         if self._has_tensor_model() and self.observation_key is not None:
             self.in_keys = list(dict.fromkeys([self.observation_key, *self._module_keys()]))
         self._expected = {key: situation[key] for key in self.in_keys}
         self._compile = compile
         self._plan = plan
-        # One for each set of shapes: compiled, each is a graph.
+        # One for each set of shapes, because each is compiled to a separate graph.
         self._planning_functions: dict[Any, Callable[..., Any]] = {}
 
-    # Construction: what fits together.
+    # Construction: checks that the arguments fit together.
 
     def _has_tensor_model(self) -> bool:
-        # A transformed environment lends its base's attributes, and its transforms would be lost.
+        # TransformedEnv forwards attributes of its base env, whose model lacks the transforms.
         return (
             not isinstance(self.env, TransformedEnv)
             and getattr(self.env, "tensor_model", None) is not None
         )
 
     def _module_keys(self) -> list[NestedKey]:
-        """What actor and critics read besides the action."""
+        """Return the keys that actor and critics read besides the action."""
         modules = [module for module in (self.actor, self.qvalue) if module is not None]
         keys = [unravel_key(key) for module in modules for key in module.in_keys]
         return [key for key in keys if key != self.action_key]
 
     def _why_not_tensors(self, default_done_keys: bool) -> str | None:
-        """Why the environment must be stepped, if so."""
+        """Return the reason why the tensor model cannot be used, or ``None``."""
         if not self._has_tensor_model():
             return f"{type(self.env).__name__} has no tensor_model of its own"
         if self.observation_key is None:
@@ -191,7 +206,7 @@ class SamplingPlanner(MPCPlannerBase):
                 raise ValueError(f"{name}: expected in_keys among {allowed}, got {unknown}.")
 
     def problem(self) -> Problem:
-        """What is planned: model, bounds, actor and value as functions."""
+        """Return model, bounds, actor and value as functions."""
         action_shape = self.action_spec.shape
         if self.uses_tensors:
             model: TensorModel = self.env.tensor_model
@@ -207,7 +222,7 @@ class SamplingPlanner(MPCPlannerBase):
         return Problem(model=model, bounds=self.bounds, actor=actor, value=value)
 
     def _build(self) -> Callable[..., Any]:
-        """The plan as a function of observation, noise and mean."""
+        """Make the plan as a function of observation and noise, compiled if wanted."""
         problem = self.problem()
         function = partial(self._plan, problem=problem, settings=self.settings)
         options = dict(self._compile) if isinstance(self._compile, dict) else {}
@@ -219,12 +234,12 @@ class SamplingPlanner(MPCPlannerBase):
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        # The functions hold on to these very modules, so a copy builds its own.
+        # The functions refer to the modules of this planner, so a copy has to build its own.
         return {**super().__getstate__(), "_planning_functions": {}}
 
     def _apply(self, *args: Any, **kwargs: Any) -> SamplingPlanner:
         self._bounds = None
-        self._planning_functions = {}  # they hold the bounds as they were
+        self._planning_functions = {}  # they refer to the old bounds
         return super()._apply(*args, **kwargs)
 
     # Planning.
@@ -232,30 +247,30 @@ class SamplingPlanner(MPCPlannerBase):
     def forward(
         self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None
     ) -> TensorDictBase:
-        """Plan, and write the action."""
-        # The stock one looks for pandas on the disk whenever it writes, and projects what a plan
-        # has in bounds already.
+        """Plan from the observations in ``tensordict``, and write the action."""
+        # The base class checks the disk for pandas at every write, and projects actions to bounds
+        # in which they already are.
         out = tensordict if tensordict_out is None else tensordict_out
         return out.set(self.action_key, self.planning(tensordict))
 
     @abstractmethod
     def planning(self, tensordict: TensorDictBase) -> Tensor:
-        """The action ``[*batch, *action_shape]`` for ``tensordict``."""
+        """Return the action ``[*batch, *action_shape]`` for the observations in ``tensordict``."""
 
     def reset(self) -> None:
-        """Forget the previous plan: a new episode starts."""
-        if self.memory is not None:
-            self.memory.clear()
+        """Drop the previous plan, at the start of an episode."""
+        if self.receding is not None:
+            self.receding.clear()
 
     @property
     def bounds(self) -> ActionBounds:
-        """Where actions may be."""
+        """The bounds of the action."""
         if self._bounds is None:
             self._bounds = ActionBounds.from_limits(self._action_low, self._action_high)
         return self._bounds
 
     def _call_plan(self, tensordict: TensorDictBase, *args: Any) -> Any:
-        """Call the plan with what it is made from, and further arguments."""
+        """Call the plan with the observation and further arguments."""
         shapes = _shapes((tensordict.batch_size, args))
         if shapes not in self._planning_functions:
             self._planning_functions[shapes] = self._build()
@@ -267,12 +282,12 @@ class SamplingPlanner(MPCPlannerBase):
             return self._planning_functions[shapes](observation, *args)
 
     def _starts(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Where an episode starts, bool ``[*batch]``, if it is known."""
+        """Return whether an episode starts, bool ``[*batch]``, or ``None`` if it is unknown."""
         is_init = tensordict.get(self.is_init_key, None)
         return None if is_init is None else is_init.reshape(tensordict.batch_size)
 
     def _draw(self, *shape: int) -> Tensor:
-        """Standard normal noise."""
+        """Draw standard normal noise."""
         low = self._action_low
         return torch.randn(shape, generator=self.generator, dtype=low.dtype, device=low.device)
 
@@ -288,20 +303,20 @@ class SamplingPlanner(MPCPlannerBase):
                     f"{key}: expected {spec.dtype} of shape {list(shape)} on {device}, "
                     f"got {value.dtype} of shape {list(value.shape)} on {value.device}."
                 )
-            # Elsewhere this would wait for the device; the plan falls back to the actor's action.
+            # On other devices this would synchronize; the plan then uses the actor's action.
             if device.type == "cpu" and not value.isfinite().all():
                 raise ValueError(f"{key}: expected finite observations, got some that are not.")
 
 
 def _shapes(arguments: Any) -> Any:
-    """The shapes of tensors, nested as they are."""
+    """Replace the tensors in nested tuples by their shapes."""
     if isinstance(arguments, tuple) and not isinstance(arguments, torch.Size):
         return tuple(map(_shapes, arguments))
     return arguments.shape if isinstance(arguments, Tensor) else arguments
 
 
 def _choose(situation: Collection[NestedKey], key: NestedKey | None) -> NestedKey | None:
-    """The observation that a tensor model is given, if it is clear which."""
+    """Return the key of the observation for a tensor model, or ``None`` if it is ambiguous."""
     if key is not None:
         if unravel_key(key) not in situation:
             raise ValueError(f"observation_key: expected one of {list(situation)}, got {key!r}.")

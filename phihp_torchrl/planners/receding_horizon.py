@@ -1,4 +1,4 @@
-"""What a planner remembers between steps: its plan, for warm starts and receding horizons."""
+"""Receding horizon: acting on a plan for several steps, and starting the next plan from it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 
-class PlanMemory:
-    """Act several steps of one plan, and start the next from where it left off.
+class RecedingHorizon:
+    """Takes several actions of one plan, and starts the next plan from the remaining actions.
 
-    It remembers one plan for each row of a batch. Rows whose episode starts anew forget theirs; all
-    do when the batch changes its shape.
+    It keeps one plan for each row of a batch. The plan of a row is dropped when a new episode
+    starts in it, and all plans are dropped when the shape of the batch changes.
 
     Args:
-        replan_every: steps of a plan to act before the next.
+        replan_every: number of actions of a plan that are taken before the next plan.
         warm_start: whether the next plan starts from the previous one, shifted.
     """
 
@@ -25,7 +25,7 @@ class PlanMemory:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all plans."""
+        """Drop all plans."""
         self._plans: Tensor | None = None
         self._age: Tensor | None = None
 
@@ -36,16 +36,16 @@ class PlanMemory:
         is_init: Tensor | None,
         center: Tensor,
     ) -> Tensor:
-        """The action of this step, ``[*batch, m]``.
+        """Return the action of this step, ``[*batch, m]``, after planning in the rows that need it.
 
         Args:
-            plan: makes a plan ``[*batch, H, m]`` around a mean of that shape, or around nothing.
+            plan: makes a plan ``[*batch, H, m]`` around a mean of that shape, or without a mean.
             batch: the batch size.
-            is_init: where an episode starts, bool ``[*batch]``, if known.
-            center: what comes before the first plan and after the end of the others, ``[H, m]``.
+            is_init: whether an episode starts, bool ``[*batch]``; ``None`` if unknown.
+            center: mean of a first plan, which also fills up shifted plans, ``[H, m]``.
         """
         cold = center.expand(*batch, *center.shape)
-        if self.replan_every == 1:  # all rows are due, always: no ages to keep, which take time
+        if self.replan_every == 1:  # every row plans at every step, so ages are not needed
             self._plans = plan(self.recall(is_init, cold) if self.warm_start else None)
             return self._plans[..., 0, :]
         plans, age = self._plans, self._age
@@ -66,20 +66,21 @@ class PlanMemory:
         return plans.gather(-2, index).squeeze(-2)
 
     def recall(self, is_init: Tensor | None, cold: Tensor) -> Tensor:
-        """The last plan shifted by ``replan_every``, to start the next from, ``[*batch, H, m]``.
+        """Return the last plan, shifted by ``replan_every``, as the mean of the next one.
 
         Args:
-            is_init: where an episode starts, bool ``[*batch]``, if known.
-            cold: what comes after its end, and in its place where there is none.
+            is_init: whether an episode starts, bool ``[*batch]``; ``None`` if unknown.
+            cold: fills up the shifted plan, and replaces it at the start of an episode,
+                ``[*batch, H, m]``.
         """
         if self._plans is None or not self._fits(cold):
-            return cold.contiguous()  # like all that follow: other strides are another graph
+            return cold.contiguous()  # other strides would need another compiled graph
         rest = self._plans[..., self.replan_every :, :]
         mean = torch.cat([rest, cold[..., : self.replan_every, :]], -2)
         return mean if is_init is None else torch.where(is_init[..., None, None], cold, mean)
 
     def remember(self, plans: Tensor) -> None:
-        """Keep ``plans`` ``[*batch, H, m]`` for :meth:`recall`, at once."""
+        """Keep ``plans`` ``[*batch, H, m]`` for :meth:`recall`."""
         self._plans = plans
 
     def _fits(self, cold: Tensor) -> bool:

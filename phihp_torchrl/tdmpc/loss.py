@@ -12,37 +12,40 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from phihp_torchrl.agents.functional import soft_update_
-from phihp_torchrl.agents.tdmpc.losses import (
+from phihp_torchrl.agents import soft_update_
+from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.config import check_not_negative, check_positive_share
+from phihp_torchrl.tdmpc.equations import (
     ModelLosses,
     Slices,
     model_losses,
     policy_loss,
     td_target,
 )
-from phihp_torchrl.agents.tdmpc.told import TOLD
-from phihp_torchrl.compilation import compile_graph
-from phihp_torchrl.ranges import check_not_negative, check_positive_share
+from phihp_torchrl.tdmpc.networks import TOLD
 
 _NOISE_CLIP = 0.3
-"""Where the published runs clip the noise on the policy's actions, in units of the bounds."""
+"""Largest noise on the policy's actions in the published runs, in units of the half-range."""
 
 
 @dataclass(frozen=True)
 class TDMPCLossConfig:
-    """How TD-MPC weighs its losses; the values are the published ones.
+    """Weights of the losses of TD-MPC.
 
     Args:
-        gamma: discount.
-        rho: weight of a step relative to the one before.
-        consistency_coef: weight of the latent's error.
-        reward_coef: weight of the reward's.
-        value_coef: weight of the critics'.
-        termination_coef: weight of the termination's, where episodes can terminate.
-        policy_noise: std of the noise on the policy's actions in the losses, in units of their
-            bounds.
-        output_penalty: weight of the squared outputs of the policy's network before tanh, in the
-            policy's loss; 0 as published.
+        gamma: discount γ.
+        rho: weight ρ of a step relative to the one before.
+        consistency_coef: weight of the error of the latent.
+        reward_coef: weight of the error of the reward.
+        value_coef: weight of the error of the critics.
+        termination_coef: weight of the error of the termination, if episodes can terminate.
+        policy_noise: std of the noise on the policy's actions in the losses, in units of the
+            action's half-range.
+        output_penalty: weight of the policy's squared outputs before tanh, which keeps tanh from
+            saturating.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
     """
 
     gamma: float = 0.99
@@ -52,7 +55,7 @@ class TDMPCLossConfig:
     value_coef: float = 0.1
     termination_coef: float = 0.5
     policy_noise: float = 0.05
-    output_penalty: float = 0.0
+    output_penalty: float = 0.005
 
     def __post_init__(self) -> None:
         check_positive_share(self, "gamma", "rho")
@@ -69,8 +72,8 @@ class TDMPCLoss(LossModule):
         L_{model} = \frac{1}{N H} \sum_n w_n (c_1 L_{consistency} + c_2 L_{reward} + c_3 L_{value}
         + c_4 L_{termination}), \qquad L_{policy}
 
-    with the terms of :func:`~phihp_torchrl.agents.tdmpc.losses.model_losses` and
-    :func:`~phihp_torchrl.agents.tdmpc.losses.policy_loss`, and the importance weights :math:`w_n`
+    with the terms of :func:`~phihp_torchrl.tdmpc.equations.model_losses` and
+    :func:`~phihp_torchrl.tdmpc.equations.policy_loss`, and the importance weights :math:`w_n`
     of prioritized replay. Both may be summed and differentiated at once, for they share no
     gradients: ``loss_model`` reaches all but the policy, ``loss_policy`` the policy alone.
 
@@ -84,7 +87,8 @@ class TDMPCLoss(LossModule):
         compile: whether to compile losses and gradients (about a minute at first).
 
     Examples:
-        >>> told = TOLD(3, [2.0])
+        >>> from phihp_torchrl.tasks import ActionBounds
+        >>> told = TOLD(3, ActionBounds.from_limits([-2.0], [2.0]))
         >>> slices = TensorDict(
         ...     observation=torch.zeros(8, 5, 3),
         ...     action=torch.zeros(8, 5, 1),
@@ -136,7 +140,7 @@ class TDMPCLoss(LossModule):
 
     @property
     def in_keys(self) -> Sequence[NestedKey]:
-        """What :meth:`forward` reads; ``priority_weight`` may be absent."""
+        """The keys that :meth:`forward` reads; ``priority_weight`` is optional."""
         keys = self.tensor_keys
         following = (keys.observation, keys.reward, keys.terminated)
         return [

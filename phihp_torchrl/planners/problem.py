@@ -1,4 +1,4 @@
-"""What a sequence of actions is worth: rewards in the model, and Q beyond the horizon."""
+"""The score of an action sequence: rewards in the model, and Q beyond the horizon (equation 4)."""
 
 from __future__ import annotations
 
@@ -10,62 +10,48 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from phihp_torchrl.tasks import ActionBounds
+
 
 class TensorModel(Protocol):
-    """A model that planners roll out as pure functions, with any leading batch dims.
+    """The interface of models for planners: pure functions with any leading batch dimensions.
 
-    :class:`~phihp_torchrl.dynamics.TaskWorldModel` is one. States and observations are tensors; an
-    environment behind the same three methods has tensordicts in their place.
+    :class:`~phihp_torchrl.dynamics.TaskWorldModel` implements it. States and observations are
+    tensors, or tensordicts where an environment is stepped.
     """
 
     def locate(self, observation: Any) -> Any:
-        """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""
+        """Map an observation ``[*batch, o]`` to the state ``[*batch, n]``."""
 
     def observe(self, state: Any) -> Any:
-        """State ``[*batch, n]`` -> observation ``[*batch, o]``."""
+        """Map a state ``[*batch, n]`` to its observation ``[*batch, o]``."""
 
     def transition(self, state: Any, action: Tensor) -> tuple[Any, Tensor, Tensor]:
-        """Next state ``[*batch, n]``, reward ``[*batch]`` and terminated, bool ``[*batch]``."""
-
-
-@dataclass(frozen=True)
-class ActionBounds:
-    """Where actions may be, ``[m]`` each, and the unit in which their noise is measured.
-
-    Args:
-        low: lower bounds.
-        high: upper bounds.
-        center: the middle; zero where there is no bound.
-        scale: the half-range; one where there is no bound.
-    """
-
-    low: Tensor
-    high: Tensor
-    center: Tensor
-    scale: Tensor
-
-    @classmethod
-    def from_limits(cls, low: Tensor, high: Tensor) -> ActionBounds:
-        """Bounds with their middle and half-range; limits may be infinite."""
-        half = high / 2 - low / 2
-        bounded = half.isfinite()
-        center = torch.where(bounded, low / 2 + high / 2, torch.zeros_like(half))
-        return cls(low, high, center, torch.where(bounded, half, torch.ones_like(half)))
-
-    def clip(self, action: Tensor) -> Tensor:
-        """Clip an action ``[*batch, m]``."""
-        return action.clamp(self.low, self.high)
+        """Return next state ``[*batch, n]``, reward and (bool) terminated, each ``[*batch]``."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What a plan is made for.
+    """The functions that a plan is computed with: model, bounds, actor and value.
 
     Args:
-        model: the model.
-        bounds: the action's bounds.
-        actor: observation ``[rows, o]`` -> action ``[rows, m]`` in physical units, or ``None``.
-        value: observation, action -> min(Q1, Q2) ``[rows]``, or ``None``. Needs an actor.
+        model: the model, with methods ``locate``, ``observe`` and ``transition`` as
+            :class:`~phihp_torchrl.dynamics.TaskWorldModel` has them.
+        bounds: bounds of the action.
+        actor: a function from observation ``[rows, o]`` to action ``[rows, m]`` in physical units,
+            or ``None``.
+        value: a function from observation and action to min(Q1, Q2) ``[rows]``, or ``None``. Needs
+            an actor.
+
+    Examples:
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> from phihp_torchrl.dynamics import TaskWorldModel
+        >>> task = get_task("cartpole")
+        >>> problem = Problem(TaskWorldModel(task, HybridDynamics.hybrid(task)), task.bounds)
+        >>> state, actions = torch.zeros(3, 4), torch.zeros(5, 3, 1)
+        >>> scores, _ = score_sequences(state, actions, problem, gamma=1.0, alpha=0.0)
+        >>> scores  # CartPole rewards every step
+        tensor([5., 5., 5.])
     """
 
     model: TensorModel
@@ -84,25 +70,26 @@ def score_sequences(
     policy_noise: Tensor | None = None,
     reduced_tail: bool = False,
 ) -> tuple[Tensor, Tensor]:
-    r"""Score sequences by rolling them out in the model (paper, equation 4).
+    r"""Score action sequences by rolling them out in the model (paper, equation 4).
 
     .. math::
         \sum_{k<H} \gamma^k r_k + \alpha \gamma^H \min(Q_1, Q_2)(s_H, \pi(s_H)),
 
-    where nothing counts after a termination. A score that is not finite becomes -inf.
+    where terms after a termination are 0. A score that is not finite becomes -inf.
 
     Args:
-        state: where each sequence starts, ``[rows, n]``.
+        state: first state of each sequence, ``[rows, n]``.
         actions: the sequences, ``[H, rows, m]``.
-        problem: model, actor and value.
+        problem: model, bounds, actor and value.
         gamma: discount.
         alpha: weight of the value term; 0 leaves it out.
-        policy_noise: makes the first ``rows'`` sequences the actor's: what is added to its actions,
-            ``[H, rows', m]``, before they are clipped.
-        reduced_tail: evaluates the value term under autocast to bfloat16.
+        policy_noise: noise ``[H, rows', m]`` on the actor's actions, which replace the actions of
+            the first ``rows'`` sequences; they are clipped with the noise.
+        reduced_tail: whether to evaluate the value term in bfloat16.
 
     Returns:
-        The scores ``[rows]`` and the sequences taken ``[H, rows, m]``.
+        The scores ``[rows]``, and the sequences with the actor's actions in them,
+        ``[H, rows, m]``.
     """
     model, actor = problem.model, problem.actor
     taken = []

@@ -11,37 +11,45 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from phihp_torchrl.agents.tdmpc.loss import TDMPCLoss, TDMPCLossConfig
-from phihp_torchrl.agents.tdmpc.told import TOLD, TOLDConfig
-from phihp_torchrl.ranges import check_positive, check_positive_share
+from phihp_torchrl.config import check_count, check_positive, check_positive_share
+from phihp_torchrl.tdmpc.loss import TDMPCLoss, TDMPCLossConfig
+from phihp_torchrl.tdmpc.networks import TOLD, TOLDConfig
 
 
 @dataclass(frozen=True)
 class TDMPCConfig:
-    """Hyper-parameters of TD-MPC's learning; the values are the published ones.
+    """Hyper-parameters of TD-MPC's learning.
 
     Args:
-        learning_rate: of encoder, dynamics, reward, termination and policy.
-        critic_learning_rate: of the critics (PhIHP's paper: 1e-4 on CartPole and Acrobot).
-        max_grad_norm: where gradients are clipped, for the model and for the policy.
-        tau: step of the targets towards the networks.
-        target_interval: updates between two steps of the targets.
+        learning_rate: learning rate of encoder, dynamics, reward, termination and policy.
+        critic_learning_rate: the critics' learning rate (1e-4 on CartPole and Acrobot).
+        max_grad_norm: largest norm of the gradients, for the model and for the policy.
+        tau: step of the target networks towards the networks.
+        target_interval: updates between two steps of the target networks.
         told: sizes of the networks.
         loss: weights of the losses.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> TDMPCConfig(tau=0.0)
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: tau: expected a number in (0, 1], got 0.0.
     """
 
     learning_rate: float = 1e-3
     critic_learning_rate: float = 1e-3
     max_grad_norm: float = 10.0
-    tau: float = 0.01
-    target_interval: int = 2
+    tau: float = 0.02
+    target_interval: int = 1
     told: TOLDConfig = field(default_factory=TOLDConfig)
     loss: TDMPCLossConfig = field(default_factory=TDMPCLossConfig)
 
     def __post_init__(self) -> None:
-        check_positive(
-            self, "learning_rate", "critic_learning_rate", "max_grad_norm", "target_interval"
-        )
+        check_positive(self, "learning_rate", "critic_learning_rate", "max_grad_norm")
+        check_count(self, "target_interval")
         check_positive_share(self, "tau")
 
 
@@ -54,7 +62,8 @@ class TDMPCUpdate:
         compile: whether to compile losses and gradients (about a minute at first).
 
     Examples:
-        >>> update = TDMPCUpdate(TOLD(3, [2.0]), TDMPCConfig())
+        >>> from phihp_torchrl import get_task
+        >>> update = TDMPCUpdate(TOLD.for_task(get_task("pendulum")), TDMPCConfig())
         >>> update.updates
         0
     """
@@ -114,9 +123,9 @@ class TDMPCUpdate:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
+        """Continue from a :meth:`state_dict`."""
         self.loss.told.load_state_dict(state["told"])
         self.loss.target.load_state_dict(state["target"])
-        # Adam would take the very tensors, and change them.
+        # A copy, because Adam keeps these tensors and changes them in place.
         self.optimizer.load_state_dict(copy.deepcopy(dict(state["optimizer"])))
         self.updates = state["updates"]

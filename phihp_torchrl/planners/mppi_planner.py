@@ -1,0 +1,135 @@
+"""Planning by path integral control as a TorchRL module, from observation to action."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from phihp_torchrl.planners.mppi import MPPIConfig, MPPINoise, MPPIPlan, mppi_plan
+from phihp_torchrl.planners.receding_horizon import RecedingHorizon
+from phihp_torchrl.planners.sampling_planner import SamplingPlanner
+
+
+class MPPIPlanner(SamplingPlanner):
+    """Plan by model-predictive path integral control, guided by a policy, as TD-MPC does.
+
+    At each call the candidates are sequences of the actor and Gaussian ones. Their scores are the
+    rewards in the model plus Q beyond the horizon, and the Gaussian is refitted to the elites, each
+    weighted by the exponential of its score. It starts from the previous plan's mean, shifted by
+    one step. Under ``set_exploration_type(ExplorationType.RANDOM)`` noise with the std of the last
+    Gaussian is added to the action.
+
+    It plans on the same environments as :class:`~phihp_torchrl.CEMPlanner`, with the same keys and
+    backends, and on latent models. :class:`torchrl.modules.MPPIPlanner` is another algorithm, which
+    weights by a learned advantage and has no actor, momentum or elites by return.
+
+    References: https://arxiv.org/abs/2203.04955.
+
+    Args:
+        env: the environment to plan on, of batch size ``[]``.
+        settings: settings of the search; the attribute :attr:`settings` may be assigned, for
+            schedules.
+        options: ``actor``, ``qvalue``, keys, ``backend``, ``compile`` and ``generator`` of
+            :class:`~phihp_torchrl.planners.SamplingPlanner`. Each horizon is compiled separately.
+
+    Raises:
+        ValueError: for an argument out of range or an unknown key; when planning, for an
+            observation that is missing, not finite, or of the wrong shape, dtype or device.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from phihp_torchrl import HybridDynamics, WorldModelEnv, get_task
+        >>> from phihp_torchrl.dynamics import TaskWorldModel
+        >>> task = get_task("pendulum")
+        >>> env = WorldModelEnv(TaskWorldModel(task, HybridDynamics.hybrid(task)))
+        >>> settings = MPPIConfig(num_candidates=64, top_k=8, num_policy_candidates=0)
+        >>> planner = MPPIPlanner(env, settings)
+        >>> observation = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 1.0]])
+        >>> planner(TensorDict(observation=observation, batch_size=[2]))["action"].shape
+        torch.Size([2, 1])
+    """
+
+    settings: MPPIConfig
+    receding: RecedingHorizon
+
+    def __init__(self, env: EnvBase, settings: MPPIConfig, **options: Any) -> None:
+        receding = RecedingHorizon(replan_every=1, warm_start=True)
+        super().__init__(env, settings, mppi_plan, receding, **options)
+        self._built_in: MPPIConfig | None = None
+
+    @classmethod
+    def from_config(cls, env: EnvBase, config: MPPIConfig, **options: Any) -> MPPIPlanner:
+        """Make the planner that ``config`` describes; ``options`` are those of the class."""
+        return cls(env, config, **options)
+
+    def draw_noise(self, batch: Sequence[int]) -> MPPINoise:
+        """Draw the random numbers of one plan for observations of this batch size."""
+        s, action_dim = self.settings, self._action_low.numel()
+        guided = s.num_policy_candidates
+        low = self._action_low
+        return MPPINoise(
+            samples=self._draw(
+                s.optim_steps, s.planning_horizon, s.num_candidates - guided, *batch, action_dim
+            ),
+            policy=self._draw(s.planning_horizon, guided, *batch, action_dim),
+            choice=torch.rand(
+                (s.top_k, *batch), generator=self.generator, dtype=low.dtype, device=low.device
+            ),
+        )
+
+    @torch.no_grad()
+    def planning(self, tensordict: TensorDictBase, noise: MPPINoise | None = None) -> Tensor:
+        """Plan from ``tensordict`` and remember the plan's mean.
+
+        Args:
+            tensordict: observations, of any batch size.
+            noise: random numbers of the plan. Drawn by default.
+
+        Returns:
+            The action ``[*batch, *action_shape]``.
+        """
+        batch = tensordict.batch_size
+        cold = self.bounds.center.expand(*batch, self.settings.planning_horizon, -1)
+        mean = self.receding.recall(self._starts(tensordict), cold)
+        found = self.plan(tensordict, noise, mean)
+        self.receding.remember(found.mean)
+        action = found.actions[..., 0, :]
+        if exploration_type() is ExplorationType.RANDOM:
+            std = found.std[..., 0, :]
+            action = self.bounds.clip(action + std * self._draw(*std.shape))
+        return action.reshape(*batch, *self.action_spec.shape)
+
+    @torch.no_grad()
+    def plan(
+        self,
+        tensordict: TensorDictBase,
+        noise: MPPINoise | None = None,
+        mean: Tensor | None = None,
+    ) -> MPPIPlan:
+        """Plan without remembering the plan; returns the whole plan.
+
+        Args:
+            tensordict: observations, of any batch size.
+            noise: random numbers of the plan. Drawn by default.
+            mean: center of the first random candidates, ``[*batch, H, m]``. Defaults to the middle
+                of the bounds.
+        """
+        self._check_observation(tensordict)
+        # Horizon and lower limit of the std are arguments of the plan, other settings constants.
+        fixed = replace(self.settings, planning_horizon=1, min_std=0.0)
+        if fixed != self._built_in:
+            self._built_in, self._planning_functions = fixed, {}
+        if noise is None:
+            noise = self.draw_noise(tensordict.batch_size)
+        # As a tensor, because a schedule of numbers would compile at every step.
+        min_std = torch.tensor(
+            self.settings.min_std, dtype=self._action_low.dtype, device=self._action_low.device
+        )
+        return self._call_plan(tensordict, noise, mean, min_std)
