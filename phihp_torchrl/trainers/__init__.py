@@ -1,56 +1,42 @@
-"""A trainer for each phase, and the run that carries them through."""
+"""A trainer for each phase of a method, and the run that goes through the phases."""
 
 from __future__ import annotations
 
-from phihp_torchrl.trainers.collect import CollectConfig
-from phihp_torchrl.trainers.config import ConfigError, from_mapping, to_mapping
+from phihp_torchrl.trainers.collect import CollectConfig, Policy, planning_policy, random_policy
+from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.evaluate import EvaluateConfig, EvaluatePhase
 from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
-from phihp_torchrl.trainers.methods import METHODS, Method, get_method, register_method
 from phihp_torchrl.trainers.model import ModelConfig, ModelTrainer, make_dynamics
-from phihp_torchrl.trainers.phases import read_result
-from phihp_torchrl.trainers.policy import PolicyTrainer
-from phihp_torchrl.trainers.policy_config import PolicyConfig, StartConfig
+from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_phase
+from phihp_torchrl.trainers.plugins import import_plugins
+from phihp_torchrl.trainers.policy import PolicyConfig, PolicyTrainer
+from phihp_torchrl.trainers.results import read_result
 from phihp_torchrl.trainers.run import RunResult, run
 from phihp_torchrl.trainers.run_config import (
-    EvaluateConfig,
     RunConfig,
     RunRequest,
-    import_plugins,
+    check_run,
     read_request,
+    read_run_config,
 )
-from phihp_torchrl.trainers.show import show_episode
+from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
 from phihp_torchrl.trainers.td3 import RealTD3Config, RealTD3Trainer
-from phihp_torchrl.trainers.tdmpc import TDMPCTrainConfig, TDMPCTrainer
 
 __all__ = [
-    "METHODS",
     "CollectConfig",
-    "ConfigError",
+    "Context",
     "EvaluateConfig",
     "LoggerConfig",
-    "Method",
     "ModelConfig",
     "ModelTrainer",
+    "Phase",
     "PolicyConfig",
     "PolicyTrainer",
     "RealTD3Config",
     "RealTD3Trainer",
     "RunConfig",
-    "RunLogger",
-    "RunRequest",
     "RunResult",
-    "StartConfig",
-    "TDMPCTrainConfig",
-    "TDMPCTrainer",
-    "from_mapping",
-    "get_method",
-    "import_plugins",
-    "make_dynamics",
-    "make_logger",
-    "read_request",
-    "read_result",
-    "register_method",
+    "read_run_config",
+    "register_phase",
     "run",
-    "show_episode",
-    "to_mapping",
 ]

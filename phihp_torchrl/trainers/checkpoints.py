@@ -1,4 +1,4 @@
-"""Checkpoints that are whole or absent, hold no pickle, and fall back to the one before."""
+"""Checkpoints without pickle, written atomically; a damaged one is replaced by an earlier one."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from torchrl.checkpoint import Checkpoint, CheckpointAdapter, CheckpointError, C
 _log = logging.getLogger(__name__)
 
 FORMAT = 1
-"""Version of what a checkpoint holds; another one is refused."""
+"""Version of the content of a checkpoint; other versions are refused."""
 
 
 class SafeStateAdapter(CheckpointAdapter):
     """A nested state of tensors, numbers and texts as one safetensors file and one JSON file.
 
-    TorchRL's own adapter reads a directory with TensorDict, which unpickles where a hostile
-    directory asks it to. The digest tells a damaged file from a whole one.
+    TorchRL's own adapter reads a directory with TensorDict, which unpickles files of a hostile
+    directory. The digest detects damaged files.
     """
 
     adapter_id = "phihp_torchrl.safe_state"
@@ -64,7 +64,7 @@ class SafeStateAdapter(CheckpointAdapter):
 
 
 class State:
-    """A state on its way to or from a checkpoint."""
+    """Holds a state while a checkpoint is written or read."""
 
     def __init__(self, state: Mapping[str, Any] | None = None) -> None:
         self.state = state or {}
@@ -83,12 +83,12 @@ def save_state(
     metadata: Mapping[str, Any],
     step: int = 0,
 ) -> Path:
-    """Save ``state`` under a rotation's ``step``, or at a path, as a whole or not at all.
+    """Save ``state`` in a rotation of checkpoints or at a path, atomically.
 
     Args:
         directory: the rotation, or the path of a single checkpoint.
         state: nested dictionaries, lists and tuples of tensors, tensordicts, numbers and texts.
-        metadata: whose state it is; :func:`load_state` demands the same.
+        metadata: description of the state; :func:`load_state` requires an equal one.
         step: position in the rotation.
     """
     checkpoint = _checkpoint(State(state))
@@ -113,7 +113,7 @@ def load_state(path: Path, *, metadata: Mapping[str, Any]) -> dict[str, Any]:
             if found.get(key) != expected:
                 raise CheckpointError(f"expected {key} {expected!r}, found {found.get(key)!r}.")
         _checkpoint(holder).load(path)
-    # Whatever a hostile or truncated file makes the readers raise, the user reads one sentence.
+    # A hostile or truncated file may raise anything; the user should read one sentence.
     except Exception as error:
         raise CheckpointError(f"{path}: not a usable checkpoint: {error}") from error
     return dict(holder.state)
@@ -122,12 +122,12 @@ def load_state(path: Path, *, metadata: Mapping[str, Any]) -> dict[str, Any]:
 def load_latest(
     rotation: CheckpointRotation, *, metadata: Mapping[str, Any]
 ) -> tuple[int, dict[str, Any]] | None:
-    """The newest intact state of a rotation and its step, or ``None`` for an empty rotation.
+    """Return the newest intact state of a rotation and its step; ``None`` for an empty rotation.
 
-    A damaged checkpoint is set aside with a warning, and the one before it is used.
+    A damaged checkpoint is renamed with a warning, and the one before it is used.
 
     Raises:
-        CheckpointError: if there are checkpoints, but none of them is usable.
+        CheckpointError: if there are checkpoints, but none of them can be read.
     """
     paths = rotation_paths(rotation)
     errors = []
@@ -149,12 +149,12 @@ def load_latest(
 
 
 def rotation_paths(rotation: CheckpointRotation) -> list[Path]:
-    """The checkpoints of a rotation by step, those whose manifest is damaged included."""
+    """List the checkpoints of a rotation by step, including damaged ones."""
     return sorted(rotation.directory.glob(f"{rotation.prefix}-" + "[0-9]" * 12))
 
 
 def clear_rotation(rotation: CheckpointRotation) -> None:
-    """Remove a rotation's checkpoints, and what killed saves have left behind."""
+    """Remove a rotation's checkpoints, and files of interrupted saves."""
     for path in [*rotation_paths(rotation), *rotation.directory.glob(f".{rotation.prefix}-*")]:
         shutil.rmtree(path, ignore_errors=True)
 

@@ -1,19 +1,16 @@
-"""How phase 1 acts in the real world: at random at first, then by planning in the model."""
+"""The policies of phase 1 in the real world: random at first, then planning in the model."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
-import gymnasium
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
 
+from phihp_torchrl.config import check_count, check_not_negative
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
-from phihp_torchrl.planners.factory import PlannerConfig, make_planner
-from phihp_torchrl.ranges import check_count, check_not_negative
+from phihp_torchrl.planners import CEMConfig, make_planner
 from phihp_torchrl.tasks import Task
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -21,19 +18,26 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """How the model-based controller collects data.
+    """How phase 1 collects real data: with plain CEM in the model, after random steps.
 
     Args:
-        planning_horizon: actions in a plan.
-        replan_every: steps of a plan to act before the next.
-        num_candidates: population of the search.
-        top_k: its elites.
-        optim_steps: its iterations.
-        noise: std of the noise on the first planned iteration's actions, in units of the action
-            bounds. It fades to zero with the last.
+        planning_horizon: actions in a plan of the CEM that collects data.
+        replan_every: number of actions of a plan that are taken before the next plan.
+        num_candidates: candidates in an iteration of this CEM.
+        top_k: elites of this CEM.
+        optim_steps: iterations of this CEM.
+        noise: std of the noise on planned actions, in units of the action's half-range; it falls
+            to zero over the iterations of collecting and fitting.
         random_hold: steps for which a random action is held in the first iteration, so that slow
             systems move.
-        exploration_reward: whether to plan for the task's exploration reward, where it has one.
+        exploration_reward: whether to plan for the task's exploration reward, if it has one.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> CollectConfig(planning_horizon=10, replan_every=5).planner().num_policy_candidates
+        0
     """
 
     planning_horizon: int = 30
@@ -48,36 +52,30 @@ class CollectConfig:
     def __post_init__(self) -> None:
         check_not_negative(self, "noise")
         check_count(self, "random_hold")
-        PlannerConfig(**self.plan())  # refuses what the planner would refuse after real steps
+        self.planner()  # refuses what the planner would refuse after real steps
 
-    def plan(self) -> dict[str, Any]:
-        """The planner's own arguments: plain CEM, rewards not discounted."""
-        return {
-            "planning_horizon": self.planning_horizon,
-            "optim_steps": self.optim_steps,
-            "num_candidates": self.num_candidates,
-            "top_k": self.top_k,
-            "replan_every": self.replan_every,
-            "num_policy_candidates": 0,
-            "gamma": 1.0,
-        }
-
-
-def make_real_env(task: Task) -> EnvBase:
-    """The task's gymnasium world as a TorchRL environment that counts and limits its steps."""
-    world = gymnasium.make("phihp/Task-v0", task=task)
-    return TransformedEnv(GymWrapper(world), StepCounter())
+    def planner(self) -> CEMConfig:
+        """Return the settings of the planner: CEM without actor and Q, rewards not discounted."""
+        return CEMConfig(
+            planning_horizon=self.planning_horizon,
+            optim_steps=self.optim_steps,
+            num_candidates=self.num_candidates,
+            top_k=self.top_k,
+            replan_every=self.replan_every,
+            num_policy_candidates=0,
+            gamma=1.0,
+        )
 
 
 def random_policy(task: Task, config: CollectConfig, generator: torch.Generator) -> Policy:
-    """Uniform actions, each held for ``config.random_hold`` steps."""
-    high = torch.tensor(task.action_high)
-    action, count = torch.zeros_like(high), 0
+    """Make a policy of uniform actions in bounds, each held for ``config.random_hold`` steps."""
+    bounds = task.bounds
+    action, count = bounds.center, 0
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         nonlocal count, action
         if count % config.random_hold == 0:
-            action = high * (2.0 * torch.rand(high.shape, generator=generator) - 1.0)
+            action = bounds.from_unit(2.0 * torch.rand(action.shape, generator=generator) - 1.0)
         count += 1
         return tensordict.set("action", action.clone())
 
@@ -91,12 +89,12 @@ def planning_policy(
     generator: torch.Generator,
     noise: float,
 ) -> Policy:
-    """Plain CEM in the model as it is, plus noise in units of the action bounds."""
+    """Make a policy that plans by CEM in the model, with noise in units of the half-range."""
     if config.exploration_reward and task.exploration_reward is not None:
         task = replace(task, reward=task.exploration_reward)
     model = TaskWorldModel(task, dynamics)
-    planner = make_planner(model, None, None, PlannerConfig(**config.plan()), generator=generator)
-    scale = noise * torch.tensor(task.action_high)
+    planner = make_planner(model, None, None, config.planner(), generator=generator)
+    scale = noise * task.bounds.scale
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict["step_count"].item() == 0:

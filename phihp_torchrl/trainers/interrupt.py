@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: finish what is in hand, then stop."""
+"""Ctrl-C and SIGTERM: finish the current unit of work, then stop."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ _log = logging.getLogger(__name__)
 
 
 class Interrupt:
-    """Context in which the first SIGINT or SIGTERM is noted, and the second one stops at once.
+    """A context that records the first SIGINT or SIGTERM; the second one stops at once.
 
-    Outside the main thread, where Python allows no signal handlers, it does nothing.
+    Outside the main thread, where Python allows no signal handlers, it has no effect.
 
     Examples:
         >>> import os, signal

@@ -1,4 +1,4 @@
-"""Where metrics, pictures and the agent go besides the run directory."""
+"""Loggers for metrics, pictures and the agent, besides the run directory."""
 
 from __future__ import annotations
 
@@ -19,16 +19,21 @@ REAL_STEPS = "real_steps"
 
 @dataclass(frozen=True)
 class LoggerConfig:
-    """Which logger, and what wandb wants to know.
+    """Settings of the logger.
 
     Args:
-        name: ``"csv"``, ``"wandb"`` or ``"tensorboard"``.
-        project: wandb's project.
-        entity: wandb's user or team; by default its own default.
-        group: runs to show together, such as the seeds of one experiment.
-        tags: labels of the run.
-        mode: ``"online"``, ``"offline"``, ``"disabled"``; by default what the variable
-            ``WANDB_MODE`` says, otherwise online.
+        name: the logger, csv, wandb or tensorboard.
+        project: project in wandb.
+        entity: user or team in wandb; null for wandb's default.
+        group: group of runs in wandb, such as the seeds of one experiment.
+        tags: labels of the run in wandb.
+        mode: mode of wandb, online, offline or disabled; null for the value of WANDB_MODE, or
+            online.
+
+    Examples:
+        >>> from phihp_torchrl import RunConfig
+        >>> RunConfig("pendulum", logger=LoggerConfig("wandb", mode="offline")).logger.project
+        'phihp'
     """
 
     name: Literal["csv", "wandb", "tensorboard"] = "csv"
@@ -40,10 +45,10 @@ class LoggerConfig:
 
 
 class RunLogger:
-    """The csv logger: nothing to do, for the run directory has ``metrics.csv`` and all files."""
+    """The csv logger, which does nothing: every run writes ``metrics.csv`` and its files."""
 
     id: str | None = None
-    """What a resumed run needs to go on with the same log."""
+    """The identifier by which a resumed run continues the same log."""
 
     def log(self, metrics: Mapping[str, Any], unit: int) -> None:
         """Log the metrics of one unit of work, ``real_steps`` among them."""
@@ -55,11 +60,11 @@ class RunLogger:
         """Log the directory of an agent."""
 
     def close(self) -> None:
-        """Write what is still in memory."""
+        """Write everything that is still in memory."""
 
 
 class WandbRunLogger(RunLogger):
-    """wandb, through TorchRL's logger, with real environment steps as the axis of every metric."""
+    """Logs to wandb through TorchRL's logger, with real steps as the axis of every metric."""
 
     def __init__(
         self, config: LoggerConfig, run: Mapping[str, Any], directory: Path, run_id: str | None
@@ -113,7 +118,7 @@ class WandbRunLogger(RunLogger):
 
 
 class TensorboardRunLogger(RunLogger):
-    """TensorBoard; its axis is the unit of work, real steps are a metric among the others."""
+    """Logs to TensorBoard, with the unit of work as the axis and real steps as a metric."""
 
     def __init__(self, directory: Path, resume_unit: int | None) -> None:
         self._logger = get_logger("tensorboard", str(directory), "tensorboard")
@@ -152,12 +157,12 @@ def make_logger(
     run_id: str | None = None,
     resume_unit: int | None = None,
 ) -> RunLogger:
-    """Open the logger that ``config`` asks for, or warn and leave it at ``metrics.csv``.
+    """Open the logger of ``config``; if it fails, log a warning and use ``metrics.csv`` only.
 
-    Nothing here asks a question on the terminal.
+    It never asks a question on the terminal.
 
     Args:
-        config: which logger.
+        config: settings of the logger.
         run: the whole configuration of the run, to be logged with it.
         directory: the run directory.
         run_id: :attr:`RunLogger.id` of the run to go on with.

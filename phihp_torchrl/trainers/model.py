@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -9,11 +10,18 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
 
-from phihp_torchrl.agents import Batch
+from phihp_torchrl.config import (
+    ConfigError,
+    check_choice,
+    check_count,
+    check_not_negative,
+    check_positive,
+    check_widths,
+)
 from phihp_torchrl.dynamics import (
     BLOCK,
+    RESIDUAL_OUTPUTS,
     DynamicsLoss,
     FitConfig,
     HybridDynamics,
@@ -23,38 +31,52 @@ from phihp_torchrl.dynamics import (
     rollout_error,
     split,
 )
+from phihp_torchrl.imagination import Batch
+from phihp_torchrl.integrators import INTEGRATORS, FixedStepIntegrator, Integrator, make_integrator
 from phihp_torchrl.tasks import Task
-from phihp_torchrl.trainers.collect import (
-    CollectConfig,
-    make_real_env,
-    planning_policy,
-    random_policy,
-)
+from phihp_torchrl.trainers.collect import CollectConfig, planning_policy, random_policy
+from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.phases import Phase, register_phase
+from phihp_torchrl.worlds import SimulatedWorld, World, disagreements, make_world
+
+_log = logging.getLogger(__name__)
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Phase 1.
+    """Settings of phase 1, which learns the model (paper, section 4.1 and appendix C).
 
     Args:
-        real_steps: real transitions in all. An oracle, which has nothing to learn, may take none.
-        steps_per_iteration: real transitions between two fits, T; ``None`` for a tenth of all of
-            them, but no fewer than 50.
-        kind: ``"hybrid"``, ``"data_driven"``, ``"prior"`` or ``"oracle"``.
-        constants_error: relative error of the prior's first guess, signs drawn by the seed.
+        real_steps: total number of real transitions; 0 is allowed for an oracle.
+        steps_per_iteration: real transitions between two fits, T; null for a tenth of all of them,
+            but at least 50.
+        kind: hybrid (prior + residual), data_driven (no prior), prior (no residual) or oracle (the
+            simulated world itself).
+        constants_error: in a simulated world, relative error of the first guesses of the prior's
+            constants, with signs drawn by the seed; in other worlds the system's guesses are used.
         hidden_sizes: widths of the residual's hidden layers.
-        activation: of the residual: ``"tanh"``, ``"silu"`` or ``"relu"``.
-        residual_outputs: ``"velocities"`` or ``"all"`` (see :meth:`HybridDynamics.hybrid`).
-        integrator: of the model.
-        lambda_0: initial weight λ of the published loss.
-        tau_ph: its growth.
-        warm_start: whether a fit starts from the one before. Those between the first and the last
-            then keep λ where it ended, and take at most ``refit_steps``.
-        refit_steps: see ``warm_start``.
-        fit: how to fit.
-        collect: how to collect.
+        activation: activation of the residual: relu, tanh or silu.
+        residual_outputs: components that the residual corrects, velocities (accelerations only) or
+            all (every component of ds/dt).
+        integrator: integrator of the model, semi_implicit_euler, rk4 or dopri5.
+        substeps: solver steps in a control step; 1 for dopri5, which chooses its steps.
+        lambda_0: initial λ of the published loss, which divides the weight of ‖F^r‖.
+        tau_ph: growth of λ with the prediction error.
+        warm_start: whether a fit starts from the previous one. The fits between the first and the
+            last then keep the final λ, and take at most refit_steps.
+        refit_steps: largest number of steps of such a fit; the first and the last fit take all.
+        fit: how the model is fitted.
+        collect: how real data are collected.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> config = ModelConfig(real_steps=1000, steps_per_iteration=400)
+        >>> config.iterations  # 400, 400 and 200 steps
+        3
     """
 
     real_steps: int = 5000
@@ -65,6 +87,7 @@ class ModelConfig:
     activation: str = "tanh"
     residual_outputs: str = "velocities"
     integrator: str = "semi_implicit_euler"
+    substeps: int = 1
     lambda_0: float = 1e3
     tau_ph: float = 1e3
     warm_start: bool = True
@@ -73,23 +96,30 @@ class ModelConfig:
     collect: CollectConfig = field(default_factory=CollectConfig)
 
     def __post_init__(self) -> None:
-        for name in ("real_steps", "steps_per_iteration", "refit_steps"):
-            value, least = getattr(self, name), 1
-            if name == "real_steps" and self.kind == "oracle":
-                least = 0
-            if value is not None and value < least:
-                raise ValueError(f"{name}: expected a number >= {least}, got {value}.")
-        if self.kind not in ("hybrid", "data_driven", "prior", "oracle"):
-            raise ValueError(
-                f"kind: expected 'hybrid', 'data_driven', 'prior' or 'oracle', got {self.kind!r}."
+        check_choice(self, "kind", ("hybrid", "data_driven", "prior", "oracle"))
+        check_count(self, "real_steps", least=0 if self.kind == "oracle" else 1)
+        if self.steps_per_iteration is not None:
+            check_count(self, "steps_per_iteration")
+        check_count(self, "refit_steps", "substeps")
+        check_choice(self, "residual_outputs", RESIDUAL_OUTPUTS)
+        check_choice(self, "activation", _ACTIVATIONS)
+        check_choice(self, "integrator", INTEGRATORS)
+        check_widths(self, "hidden_sizes")
+        check_positive(self, "lambda_0")
+        check_not_negative(self, "tau_ph")
+        if not 0 <= self.constants_error < 1:
+            raise ConfigError(
+                "constants_error",
+                f"expected a relative error in [0, 1), got {self.constants_error}.",
             )
-        if self.residual_outputs not in ("velocities", "all"):
-            raise ValueError(
-                f"residual_outputs: expected 'velocities' or 'all', got {self.residual_outputs!r}."
-            )
-        if self.activation not in _ACTIVATIONS:
-            raise ValueError(
-                f"activation: expected one of {sorted(_ACTIVATIONS)}, got {self.activation!r}."
+        fixed = issubclass(INTEGRATORS[self.integrator], FixedStepIntegrator)
+        if self.substeps > 1 and not fixed:
+            raise ConfigError("substeps", f"expected 1 for {self.integrator}, got {self.substeps}.")
+        if self.kind != "oracle" and self.fit.method != "adam" and not fixed:
+            raise ConfigError(
+                "fit.method",
+                f"expected 'adam' for a model that is integrated by {self.integrator}, which "
+                f"chooses its own steps, got {self.fit.method!r}.",
             )
 
     @property
@@ -104,47 +134,73 @@ class ModelConfig:
 
 
 def make_dynamics(
-    task: Task, config: ModelConfig, generator: torch.Generator | None = None
+    world: World, config: ModelConfig, generator: torch.Generator | None = None
 ) -> HybridDynamics:
-    """The model of ``config``, untrained.
+    """Build the untrained model that ``config`` describes, for the task of ``world``.
 
     Args:
-        task: the task.
-        config: phase 1.
-        generator: source of the signs of the first guess's errors. The networks' initial weights
-            come from torch's global generator.
+        world: the world. If it is simulated, its equations are the oracle's model, and its true
+            constants are perturbed for the first guesses.
+        config: settings of phase 1.
+        generator: source of the signs of the errors of the first guesses. The initial weights of
+            networks come from torch's global generator.
+
+    Raises:
+        ConfigError: for an oracle in a world that is not simulated.
     """
+    task = world.task
     if config.kind == "oracle":
-        return HybridDynamics.oracle(task)
+        if not isinstance(world, SimulatedWorld):
+            raise ConfigError(
+                "model.kind", f"expected another than 'oracle': {world} has no truth to plan with."
+            )
+        return world.oracle()
+    settings = {"substeps": config.substeps} if config.substeps > 1 else {}
+    integrator: Integrator = make_integrator(config.integrator, **settings)
     activation, sizes = _ACTIVATIONS[config.activation], config.hidden_sizes
     if config.kind == "data_driven":
         return HybridDynamics.data_driven(
-            task, hidden_sizes=sizes, activation=activation, integrator=config.integrator
+            task, hidden_sizes=sizes, activation=activation, integrator=integrator
         )
-    guess = perturbed_constants(task.system, config.constants_error, generator)
+    guess = _first_guess(world, config.constants_error, generator)
     if config.kind == "prior":
-        return HybridDynamics.pure_prior(task, constants=guess, integrator=config.integrator)
+        return HybridDynamics.pure_prior(task, constants=guess, integrator=integrator)
     return HybridDynamics.hybrid(
         task,
         constants=guess,
         hidden_sizes=sizes,
         activation=activation,
         residual_outputs=config.residual_outputs,
-        integrator=config.integrator,
+        integrator=integrator,
     )
 
 
+def _first_guess(world: World, error: float, generator: torch.Generator | None) -> dict[str, float]:
+    """First guesses: those of the system, or perturbed true constants in a simulated world."""
+    ranges = world.task.system.ranges
+    if world.truth is None:
+        return {name: c.guess for name, c in ranges.items()}
+    wrong = perturbed_constants(world.truth.constants, error, generator)
+    # Fixed and bounded constants keep the guess of the system.
+    return {n: c.guess if c.fixed or c.bounded else wrong[n] for n, c in ranges.items()}
+
+
 class ModelTrainer:
-    """Learns the model from real steps: random steps, fit, planned steps, fit, and so on.
+    """Phase 1: learns the model from real steps (paper, section 4.1 and appendix C).
+
+    It alternates between collecting real steps, at random in the first iteration and by planning
+    in later ones, and fitting the model.
 
     Args:
         task: the task.
-        config: phase 1.
-        env: the real world, with batch size ``[]``. Defaults to the task's gymnasium world.
-        seed: of everything random here.
+        config: settings of phase 1.
+        seed: seed of all random numbers of this phase.
+        world: the real world, in any form that :func:`~phihp_torchrl.make_world` accepts. Defaults
+            to the simulated world of the task.
 
     Raises:
-        ValueError: if the environment lacks ``"observation"`` or ``"action"``.
+        ConfigError: for a world that does not fit the task, and for an oracle in a world that is
+            not simulated.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -157,20 +213,19 @@ class ModelTrainer:
     """
 
     def __init__(
-        self, task: Task, config: ModelConfig, *, seed: int, env: EnvBase | None = None
+        self, task: Task, config: ModelConfig, *, seed: int, world: Any = "simulated"
     ) -> None:
         self.task = task
         self.config = config
-        self.env = make_real_env(task) if env is None else env
-        for key in ("observation", "action"):
-            if key not in (*self.env.observation_spec.keys(), *self.env.full_action_spec.keys()):
-                raise ValueError(f"env: expected an environment with {key!r}, got {self.env}.")
+        self.world = make_world(task, world)
+        self.env = self.world.make_env()
         self.generator = torch.Generator().manual_seed(seed)
-        self.dynamics = make_dynamics(task, config, self.generator)
+        self.dynamics = make_dynamics(self.world, config, self.generator)
         self.initial = {k: v.clone() for k, v in self.dynamics.state_dict().items()}
         self.loss = DynamicsLoss(self.dynamics, lambda_0=config.lambda_0, tau_ph=config.tau_ph)
         self.data: TensorDict | None = None
         self.iteration = 0
+        self._told: set[str] = set()
         self.env.set_seed(self._draw_seed())
 
     @property
@@ -189,30 +244,31 @@ class ModelTrainer:
         return self.real_steps >= self.config.real_steps
 
     def states(self) -> Tensor:
-        """All states seen, ``[N, n]``."""
+        """Return all states of the real data, ``[N, n]``."""
         return self.transitions().state
 
     def transitions(self) -> Batch:
-        """All real transitions, ``[N]``, as replay buffers take them."""
+        """Return all real transitions, ``[N]``, in the form of replay buffers."""
         if self.data is None:
-            system = self.task.system
-            state, action = torch.zeros(0, system.state_dim), torch.zeros(0, system.action_dim)
+            state = torch.zeros(0, self.task.state_dim)
+            action = torch.zeros(0, self.task.action_dim)
             return Batch(state, action, torch.zeros(0), state, torch.zeros(0, dtype=torch.bool))
         state, action, next_state = self.loss.transitions(self.data)
-        # The data's "done" has truncations among it, after which values go on.
+        # "done" in the data includes truncations, which are not terminations.
         terminated = self.task.is_terminated(next_state)
         return Batch(state, action, self.data["next", "reward"][:, 0], next_state, terminated)
 
     def parts(self) -> dict[str, Any]:
-        """The model, as an argument of :class:`~phihp_torchrl.deployment.Agent`."""
+        """Return the model, as an argument of :class:`~phihp_torchrl.Agent`."""
         return {"dynamics": self.dynamics}
 
     def advance(self) -> dict[str, float]:
-        """Collect once and fit once; returns what to log."""
+        """Collect once and fit once; returns metrics."""
         steps = min(self.config.period, self.config.real_steps - self.real_steps)
         new = self.collect(steps)
         self.data = new if self.data is None else torch.cat([self.data, new])
         self.iteration += 1
+        self._tell_disagreements()
         metrics = {"real_steps": self.real_steps, "collect/reward": new["next", "reward"].mean()}
         if self.config.kind != "oracle":
             metrics |= self.fit()
@@ -228,7 +284,7 @@ class ModelTrainer:
             policy = planning_policy(
                 self.task, self.dynamics, config.collect, generator, fade * config.collect.noise
             )
-        # A seed of its own for every iteration: a resumed run sees the same resets.
+        # Each iteration has its seed, so that a resumed run has the same resets.
         self.env.set_seed(self._draw_seed())
         with torch.no_grad():
             rollout = self.env.rollout(steps, policy, break_when_any_done=False)
@@ -241,10 +297,21 @@ class ModelTrainer:
                 observation=rollout["next", "observation"].float(),
                 reward=rollout["next", "reward"].float(),
                 done=done,
+                terminated=rollout["next", "terminated"],
                 batch_size=[steps],
             ),
             batch_size=[steps],
         ).detach()
+
+    def _tell_disagreements(self) -> None:
+        """Warn where real transitions contradict the task, when first seen and at the end."""
+        if self.world.truth is not None or self.data is None:
+            return
+        for sentence in disagreements(self.task, self.data):
+            about = sentence.split(" of ")[0].rstrip("0123456789 ")
+            if about not in self._told or self.done:
+                self._told.add(about)
+                _log.warning("After %d real steps: %s.", self.real_steps, sentence)
 
     def fit(self) -> dict[str, Tensor | float]:
         """Fit the model to all data and measure it."""
@@ -278,7 +345,7 @@ class ModelTrainer:
         return metrics
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that a resumed run needs, tensors and numbers only."""
+        """Return the state that a resumed run needs, as tensors and numbers."""
         return {
             "dynamics": self.dynamics.state_dict(),
             "initial": self.initial,
@@ -289,7 +356,7 @@ class ModelTrainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
+        """Continue from a :meth:`state_dict`."""
         self.dynamics.load_state_dict(state["dynamics"])
         self.initial = dict(state["initial"])
         for name, value in state["loss"].items():
@@ -301,3 +368,11 @@ class ModelTrainer:
 
     def _draw_seed(self) -> int:
         return int(torch.randint(2**31, (), generator=self.generator))
+
+
+def _build(context: Context) -> Phase:
+    config = context.settings
+    return ModelTrainer(context.task, config, seed=context.config.seed, world=context.world)
+
+
+register_phase("model", ModelConfig, _build, unit="steps")

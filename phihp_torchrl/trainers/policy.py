@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -14,44 +15,162 @@ from torch import Tensor
 from phihp_torchrl.agents import (
     CriticRefit,
     FlatReplay,
-    Imagination,
-    Worlds,
+    RefitConfig,
+    TD3Config,
+    act,
     copy_actor,
     copy_twin_qvalue,
     learning_rate_scale,
 )
+from phihp_torchrl.config import (
+    ConfigError,
+    check_count,
+    check_not_negative,
+    check_positive,
+    check_share,
+)
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
-from phihp_torchrl.envs import make_start_states
+from phihp_torchrl.imagination import Rollouts, StartConfig, Worlds, make_start_states
 from phihp_torchrl.tasks import Task
-from phihp_torchrl.trainers.policy_config import PolicyConfig
+from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.phases import Phase, register_phase
 from phihp_torchrl.trainers.td3_base import TD3Trainer
+from phihp_torchrl.worlds import World
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Settings of phase 2, which trains actor and critics in imagination (paper, section 4.2).
+
+    Args:
+        updates: total number of critic updates.
+        batch_size: transitions in an update.
+        num_worlds: number of imagined worlds that are stepped at once.
+        chunk_steps: steps of all worlds between two rounds of updates.
+        updates_per_step: critic updates for each step of all worlds.
+        replay_capacity: imagined transitions kept for replay.
+        random_steps: imagined transitions under random actions before the first update.
+        exploration_noise: std of the noise on actions, in units of the action's half-range.
+        random_fraction: share of actions that are uniformly random.
+        max_age: steps after which an imagined episode is truncated; null for the task's limit.
+        decay: share of the updates, at the end, over which learning rates fall to a twentieth.
+        evaluation_interval: updates between two evaluations in the model, which choose the actor to
+            keep.
+        evaluation_episodes: imagined episodes in an evaluation.
+        evaluation_steps: steps in these episodes; null for the task's limit.
+        real_evaluation_episodes: episodes of the actor in a simulated world at each evaluation,
+            which are logged and not used for training; 0 for none.
+        max_seconds: duration after which the phase ends early; null for no limit.
+        start: where imagined episodes start.
+        td3: hyper-parameters of TD3.
+        refit: when and how the critics are fitted to the best actor's returns in the model.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> PolicyConfig(random_fraction=1.5)
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: random_fraction: expected a number in [0, 1], got 1.5.
+    """
+
+    updates: int = 8000
+    batch_size: int = 128
+    num_worlds: int = 64
+    chunk_steps: int = 4
+    updates_per_step: int = 8
+    replay_capacity: int = 200_000
+    random_steps: int = 2048
+    exploration_noise: float = 0.1
+    random_fraction: float = 0.1
+    max_age: int | None = None
+    decay: float = 0.5
+    evaluation_interval: int = 500
+    evaluation_episodes: int = 64
+    evaluation_steps: int | None = None
+    real_evaluation_episodes: int = 10
+    max_seconds: float | None = None
+    start: StartConfig = field(default_factory=StartConfig)
+    td3: TD3Config = field(default_factory=TD3Config)
+    refit: RefitConfig = field(default_factory=RefitConfig)
+
+    def __post_init__(self) -> None:
+        check_count(
+            self,
+            "updates",
+            "batch_size",
+            "num_worlds",
+            "chunk_steps",
+            "updates_per_step",
+            "replay_capacity",
+            "evaluation_interval",
+            "evaluation_episodes",
+        )
+        check_share(self, "random_fraction", "decay")
+        check_count(self, "random_steps", "real_evaluation_episodes", least=0)
+        check_not_negative(self, "exploration_noise")
+        if self.random_steps > self.replay_capacity:
+            raise ConfigError(
+                "random_steps",
+                f"expected at most replay_capacity = {self.replay_capacity}, "
+                f"got {self.random_steps}.",
+            )
+        for name in ("max_age", "evaluation_steps", "max_seconds"):
+            if getattr(self, name) is not None:
+                check_positive(self, name)
+        chunk_updates = self.chunk_steps * self.updates_per_step
+        for name, value in (
+            ("chunk_steps * updates_per_step", chunk_updates),
+            ("evaluation_interval", self.evaluation_interval),
+        ):
+            if value % self.td3.policy_delay:
+                raise ConfigError(
+                    name,
+                    f"expected a multiple of td3.policy_delay = {self.td3.policy_delay}, "
+                    f"got {value}.",
+                )
+        for name in ("start", "interval") if self.refit.interval else ():
+            value = getattr(self.refit, name)
+            if value % self.evaluation_interval:
+                raise ConfigError(
+                    f"refit.{name}",
+                    f"expected a multiple of evaluation_interval = {self.evaluation_interval}, "
+                    f"got {value}.",
+                )
 
 
 class PolicyTrainer(TD3Trainer):
-    """Learns actor and critics from imagined transitions, many worlds at once.
+    """Phase 2: trains actor and critics by TD3 in imagination (paper, section 4.2).
 
-    After every ``evaluation_interval`` updates the noise-free actor plays episodes from the task's
-    resets in the model, and the best actor met is kept together with its critics. The real world
-    is played in for the log alone: neither it nor an evaluation seed has a say in that choice.
+    After every ``evaluation_interval`` updates the noise-free actor is evaluated in the model, from
+    the task's reset box, and the best actor so far is kept with its critics. Returns in a simulated
+    world are only logged; neither they nor seeds of evaluation affect that choice.
 
-    Where ``config.refit`` says so, the critics of the best actor so far are fitted to what it earns
-    in the model, and training goes on from there: policy iteration, with TD3 as the improvement.
-    The last fit makes the critics that the planner relies on.
+    At the updates that ``config.refit`` sets, the critics of the best actor so far are fitted to
+    its returns in the model, and training continues from these. The last fit gives the critics that
+    the planner uses.
 
     Args:
         task: the task.
         dynamics: the model to imagine with; it is not changed.
-        config: phase 2.
-        seed: of everything random here but the networks' initial weights, which come from torch's
-            global generator.
+        config: settings of phase 2.
+        world: the real world; if it is simulated, the actor's returns in it are logged.
+        seed: seed of all random numbers but the initial weights of the networks, which come from
+            torch's global generator.
         data_states: states of real transitions ``[N, n]``, for ``start.data`` > 0.
-        compile: whether to compile the hot loops: the TD3 step, imagination, and fitting critics.
+        compile: whether to compile the TD3 step, imagination, and the fit of the critics.
 
     Examples:
         >>> from phihp_torchrl import get_task
         >>> task = get_task("pendulum")
-        >>> config = PolicyConfig(updates=4, evaluation_interval=4, evaluation_steps=5)
-        >>> trainer = PolicyTrainer(task, HybridDynamics.oracle(task), config, seed=0)
+        >>> config = PolicyConfig(
+        ...     updates=4,
+        ...     evaluation_interval=4,
+        ...     evaluation_steps=5,
+        ...     refit=RefitConfig(interval=0),
+        ... )
+        >>> trainer = PolicyTrainer(task, HybridDynamics.hybrid(task), config, seed=0)
         >>> while not trainer.done:
         ...     metrics = trainer.advance()
         >>> trainer.best_actor().out_keys
@@ -64,6 +183,7 @@ class PolicyTrainer(TD3Trainer):
         dynamics: HybridDynamics,
         config: PolicyConfig,
         *,
+        world: World | None = None,
         seed: int,
         data_states: Tensor | None = None,
         compile: bool = False,
@@ -71,36 +191,28 @@ class PolicyTrainer(TD3Trainer):
         self.world_model = TaskWorldModel(task, dynamics)
         super().__init__(self.world_model, config.td3, seed=seed, compile=compile)
         self.config = config
-        self.start_states = make_start_states(task, **vars(config.start), states=data_states)
-        self.imagination = Imagination(
-            self.world_model, self.loss.max_action, self.max_age, compile=compile
-        )
+        self.start_states = make_start_states(task, config.start, states=data_states)
+        self.rollouts = Rollouts(self.world_model, act, self.max_age, compile=compile)
         self.refit = CriticRefit(
-            self.world_model, self.imagination, config.refit, config.td3.gamma, compile=compile
+            self.world_model, self.rollouts, config.refit, config.td3.gamma, compile=compile
         )
-        self.replay = FlatReplay(
-            config.replay_capacity, task.system.state_dim, task.system.action_dim
-        )
+        self.replay = FlatReplay(config.replay_capacity, task.state_dim, task.action_dim)
         self.worlds = self._new_worlds()
         self.best = [layer.clone() for layer in (*self.update.actor, *self.update.critics)]
         self.best_return = -math.inf
         self._evaluation_states = task.reset.sample(
             [config.evaluation_episodes], generator=self.generator
         )
+        truth = None if world is None else world.model()
+        self._real = None if truth is None else Rollouts(truth, act, self.max_age, compile=compile)
         # The world's episodes have a generator of their own: the log has no part in the training.
-        self._world = Imagination(
-            TaskWorldModel(task, HybridDynamics.oracle(task)),
-            self.loss.max_action,
-            self.max_age,
-            compile=compile,
-        )
         self._world_states = task.reset.sample(
             [config.real_evaluation_episodes], generator=torch.Generator().manual_seed(seed)
         )
 
     @property
     def max_age(self) -> int:
-        """Steps that an imagined life lasts at most."""
+        """Largest number of steps in an imagined episode."""
         return self.config.max_age or self.task.max_steps
 
     @property
@@ -131,7 +243,7 @@ class PolicyTrainer(TD3Trainer):
                     scale = learning_rate_scale(left, config.decay)
                     losses = self._learn(config.batch_size, scale)
                 self.updates += 1
-        imagined = self._play(self.imagination, self._evaluation_states)
+        imagined = self._play(self.rollouts, self._evaluation_states)
         # Of equal ones the later, which has learned more; none that left the finite numbers.
         if -math.inf < imagined >= self.best_return:
             self.best_return = imagined
@@ -145,8 +257,8 @@ class PolicyTrainer(TD3Trainer):
         }
         if config.refit.is_due(self.updates, config.updates):
             metrics |= self._refit_critics()
-        if config.real_evaluation_episodes:
-            metrics["policy/real_return"] = self._play(self._world, self._world_states)
+        if config.real_evaluation_episodes and self._real is not None:
+            metrics["policy/real_return"] = self._play(self._real, self._world_states)
         self.seconds += time.perf_counter() - start
         return {**metrics, "policy/seconds": self.seconds}
 
@@ -177,7 +289,7 @@ class PolicyTrainer(TD3Trainer):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
+        """Continue from a :meth:`state_dict`."""
         super().load_state_dict(state)
         for kept, layer in zip(self.best, state["best"], strict=True):
             kept.copy_(layer)
@@ -185,7 +297,7 @@ class PolicyTrainer(TD3Trainer):
         self._evaluation_states = state["evaluation_states"]
         self._world_states = state["world_states"]
 
-    def _play(self, world: Imagination, states: Tensor) -> float:
+    def _play(self, world: Rollouts, states: Tensor) -> float:
         """Mean return of the noise-free actor; minus infinity where it left the finite numbers."""
         steps = self.config.evaluation_steps or self.task.max_steps
         score = world.returns(self.update.networks.actor, states, steps).total
@@ -222,10 +334,26 @@ class PolicyTrainer(TD3Trainer):
         while True:
             warm = len(self.replay) >= config.random_steps
             self._act(
-                self.imagination,
+                self.rollouts,
                 self.start_states.sample([config.chunk_steps, config.num_worlds], self.generator),
                 noise=config.exploration_noise,
                 random_fraction=config.random_fraction if warm else 1.0,
             )
             if warm:
                 return
+
+
+def _build(context: Context) -> Phase:
+    config, model = context.config, context.before["model"]
+    return PolicyTrainer(
+        context.task,
+        model.dynamics,
+        context.settings,
+        world=context.world,
+        seed=config.seed,
+        data_states=model.states(),
+        compile=config.compile,
+    )
+
+
+register_phase("policy", PolicyConfig, _build, unit="updates")

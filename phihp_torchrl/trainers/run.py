@@ -15,33 +15,41 @@ import torch
 from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from tqdm.auto import tqdm
 
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.origin import describe_origin
+from phihp_torchrl.tasks import Task, get_task
 from phihp_torchrl.trainers.checkpoints import (
     clear_rotation,
     load_latest,
     load_state,
     save_state,
 )
-from phihp_torchrl.trainers.config import ConfigError, to_mapping
+from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.interrupt import Interrupt
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
-from phihp_torchrl.trainers.phases import PHASE_KINDS, Phase, check_phases, make_phase, real_steps
-from phihp_torchrl.trainers.run_config import RunConfig, check_task
+from phihp_torchrl.trainers.phases import PHASES, Phase, real_steps
+from phihp_torchrl.trainers.run_config import RunConfig, check_run
 from phihp_torchrl.trainers.run_directory import MetricsTable, RunDirectory
 from phihp_torchrl.trainers.start import check_same, start_directory
+from phihp_torchrl.worlds import World, make_world
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run ended.
+    """The result of :func:`run`.
 
     Args:
-        path: its directory.
+        path: directory of the run.
         finished: whether all its phases are done.
-        signal: number of the signal that asked it to stop, or ``None``.
+        signal: number of the signal that stopped it, or ``None``.
         metrics: the last value of every metric that this process logged.
+
+    Examples:
+        >>> result = RunResult(Path("outputs/my-run"), False, signal=15, metrics={})
+        >>> f"resume={result.path}" if not result.finished else "done"
+        'resume=outputs/my-run'
     """
 
     path: Path
@@ -52,50 +60,75 @@ class RunResult:
 
 @dataclass
 class _Position:
-    """Where a run stands; part of every checkpoint."""
+    """The progress of a run, which is part of every checkpoint."""
 
     unit: int  # units of work done, over all phases; also the rows of metrics.csv
     real_steps: int
     seconds: dict[str, float]  # by phase
 
 
-def run(config: RunConfig, path: str | Path | None = None, *, resume: bool = False) -> RunResult:
-    """Run the phases that ``config`` names.
+def run(
+    config: RunConfig,
+    path: str | Path | None = None,
+    *,
+    resume: bool = False,
+    world: World | None = None,
+) -> RunResult:
+    """Run the phases of a method, with logs and checkpoints, or resume such a run.
 
-    Each phase starts from the seed alone, so that a phase run on its own from a checkpoint does
-    what it would have done in a whole run.
+    Each phase starts with the seed of the run, so that a phase that is run separately, from the
+    results of earlier ones, gives the same result as in a whole run.
 
     Args:
-        config: everything about the run but its place.
-        path: the run directory; by default a new one under ``outputs/``.
-        resume: go on with the run in ``path`` as if it had never stopped.
+        config: settings of the run.
+        path: directory of the run; by default a new one under ``outputs/``.
+        resume: whether to continue the run in ``path`` from its last checkpoint.
+        world: the real world. Defaults to the one that ``config.world`` describes.
+
+    Returns:
+        The directory, whether the run is finished, and the last metrics.
 
     Raises:
-        ConfigError: if the directory is not fit for that, or ``config`` is not the one that the run
-            was started with; before any step is spent.
-        CheckpointError: if no checkpoint of the run is usable.
+        ConfigError: before any real step, if the directory holds another run, or ``config`` differs
+            from that of the run to resume.
+        CheckpointError: if no checkpoint of the run can be read.
+
+    Examples:
+        >>> import tempfile
+        >>> from phihp_torchrl.dynamics import FitConfig
+        >>> from phihp_torchrl.trainers import ModelConfig
+        >>> model = ModelConfig(real_steps=20, fit=FitConfig(steps=1))
+        >>> options = {"phases": ("model",), "sections": {"model": model}, "progress": False}
+        >>> with tempfile.TemporaryDirectory() as place:
+        ...     result = run(RunConfig("pendulum", **options), f"{place}/run")
+        ...     result.finished, (result.path / "metrics.csv").is_file()
+        (True, True)
     """
     torch.set_num_threads(config.threads)
     # Adam's moments of unused weights become denormal, and those are slow.
     torch.set_flush_denormal(True)
-    check_task(config)
-    check_phases(config)
+    if world is None:
+        world = make_world(_find_task(config), config.world)
+    check_run(config, world)
     if resume:
         if path is None:
-            raise ConfigError("resume: expected the directory of a run.")
+            raise ConfigError("resume", "expected the directory of a run.")
         directory = RunDirectory(path, config.keep_checkpoints)
         check_same(config, directory)
     else:
         config, directory = start_directory(config, path)
     with Interrupt() as interrupt:
-        return _Run(config, directory, interrupt).run()
+        return _Run(config, world, directory, interrupt).run()
 
 
 class _Run:
     """The loop over phases, and over the units of each."""
 
-    def __init__(self, config: RunConfig, directory: RunDirectory, interrupt: Interrupt) -> None:
+    def __init__(
+        self, config: RunConfig, world: World, directory: RunDirectory, interrupt: Interrupt
+    ) -> None:
         self.config = config
+        self.world = world
         self.directory = directory
         self.interrupt = interrupt
         self.origin = {"task": config.task}
@@ -109,7 +142,7 @@ class _Run:
         try:
             for name in (*self.config.phases_before, *self.config.phases_to_do):
                 _seed_everything(self.config.seed)
-                phase = make_phase(name, self.config, self.phases, self.directory)
+                phase = self._make_phase(name)
                 self.phases[name] = phase
                 if self.directory.phase(name).exists():
                     self._restore(
@@ -127,13 +160,24 @@ class _Run:
             logger.close()
         return RunResult(self.directory.path, finished, self.interrupt.signal, self.latest)
 
+    def _make_phase(self, name: str) -> Phase:
+        context = Context(
+            config=self.config,
+            settings=self.config.section(name),
+            task=self.world.task,
+            world=self.world,
+            before=dict(self.phases),
+            directory=self.directory,
+        )
+        return PHASES[name].build(context)
+
     def _advance(self, name: str, phase: Phase, table: MetricsTable, logger: RunLogger) -> bool:
         """Work through a phase; false if a signal ended it early."""
         position, saved = self.position, time.monotonic()
         done, total = phase.progress
         hidden = None if self.config.progress else True  # None: shown on a terminal alone
         with tqdm(
-            desc=name, initial=done, total=total, unit=f" {PHASE_KINDS[name].unit}", disable=hidden
+            desc=name, initial=done, total=total, unit=f" {PHASES[name].unit}", disable=hidden
         ) as bar:
             while not phase.done:
                 if self.interrupt:
@@ -219,7 +263,7 @@ class _Run:
         resumed = bool(metadata.get("sessions"))
         logger = make_logger(
             self.config.logger,
-            to_mapping(self.config),
+            self.config.to_mapping(),
             self.directory.path,
             run_id=metadata.get("logger_id"),
             resume_unit=unit if resumed else None,
@@ -232,6 +276,15 @@ class _Run:
         return table, logger
 
 
+def _find_task(config: RunConfig) -> Task:
+    try:
+        return get_task(config.task)
+    except ConfigError as error:
+        raise ConfigError(
+            error.key, f"{error.reason} A plugin may register more: plugins=[my_task.py]."
+        ) from error
+
+
 def _seed_everything(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed % 2**32)
@@ -239,7 +292,7 @@ def _seed_everything(seed: int) -> None:
 
 
 def _summary(metrics: Mapping[str, float]) -> str:
-    """The returns among the metrics, or else the errors and losses."""
+    """Format the returns among the metrics, or else the errors and losses."""
     for words in (("return",), ("error", "loss")):
         chosen = {k: v for k, v in metrics.items() if any(word in k for word in words)}
         if chosen:

@@ -1,4 +1,4 @@
-"""What a run leaves on disk, so that it can be read, repeated and resumed."""
+"""The files of a run, from which it can be read, repeated and resumed."""
 
 from __future__ import annotations
 
@@ -13,24 +13,31 @@ from typing import Any
 from omegaconf import OmegaConf
 from torchrl.checkpoint import CheckpointRotation
 
-from phihp_torchrl.trainers.config import ConfigError
+from phihp_torchrl.config import ConfigError
+
+# What runs did before there were these settings, whose defaults are others.
+_BEFORE = {
+    ("model", "fit", "shuffle_actions"): False,
+    ("policy", "refit", "interval"): 0,
+    ("policy", "refit", "start"): 0,
+}
 
 
 class RunDirectory:
-    """The directory of a run, and the names of what is in it.
+    """The directory of a run, and the paths of its files.
 
     ========================= =====================================================================
     ``config.yaml``           the whole configuration
     ``metadata.json``         seed, commit, command, machine, versions, seconds of each phase
     ``metrics.csv``           a row for each unit of work
-    ``checkpoints/``          the last few states of the phase under way
-    ``phases/<phase>/``       the state each finished phase ended with
-    ``agent/``, ``episode.*`` what the last phase makes: the agent, a picture and a GIF
+    ``checkpoints/``          the latest states of the current phase
+    ``phases/<phase>/``       the final state of each finished phase
+    ``agent/``, ``episode.*`` results of the last phase: the agent, a figure and a GIF
     ========================= =====================================================================
 
     Args:
         path: the directory.
-        keep_checkpoints: how many checkpoints stay.
+        keep_checkpoints: number of checkpoints that are kept.
     """
 
     def __init__(self, path: str | Path, keep_checkpoints: int = 2) -> None:
@@ -45,45 +52,56 @@ class RunDirectory:
         )
 
     def phase(self, name: str) -> Path:
-        """Where the final state of a phase is."""
+        """Return the path of the final state of a phase."""
         return self.path / "phases" / name
 
     def read_config(self) -> dict[str, Any]:
-        """The configuration that the run was started with.
+        """Read the configuration with which the run was started.
 
         Raises:
             ConfigError: if this is no run directory, or its configuration cannot be read.
         """
         if not self.config.is_file():
-            raise ConfigError(f"{self.path}: not the directory of a run, it has no config.yaml.")
+            raise ConfigError(str(self.path), "not the directory of a run, it has no config.yaml.")
         try:
             config = OmegaConf.to_container(OmegaConf.load(self.config))
         except Exception as error:  # YAML's, OmegaConf's and the system's errors have no base
-            raise ConfigError(f"{self.config}: cannot be read: {error}") from error
+            raise ConfigError(str(self.config), f"cannot be read: {error}") from error
         if not isinstance(config, dict):
-            raise ConfigError(f"{self.config}: expected keys and values, got {config!r}.")
-        return config  # type: ignore[return-value]
+            raise ConfigError(str(self.config), f"expected keys and values, got {config!r}.")
+        return _complete(config)  # type: ignore[arg-type]
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Write the configuration, as YAML."""
         write_atomically(self.config, OmegaConf.to_yaml(OmegaConf.create(dict(config))))
 
     def read_metadata(self) -> dict[str, Any]:
-        """What :meth:`write_metadata` wrote; empty if nothing was."""
+        """Read the metadata; empty if there are none."""
         try:
             return json.loads(self.metadata.read_text())
         except FileNotFoundError:
             return {}
         except ValueError as error:
-            raise ConfigError(f"{self.metadata}: cannot be read: {error}") from error
+            raise ConfigError(str(self.metadata), f"cannot be read: {error}") from error
 
     def write_metadata(self, metadata: Mapping[str, Any]) -> None:
-        """Write where the run comes from and how long it took, as JSON."""
+        """Write the origin and the duration of the run, as JSON."""
         write_atomically(self.metadata, json.dumps(metadata, indent=2) + "\n")
 
 
+def _complete(config: dict[str, Any]) -> dict[str, Any]:
+    """Add to the sections of an older run the settings that say what it did without them."""
+    for (phase, *path), value in _BEFORE.items():
+        section = config.get(phase)
+        for key in path[:-1] if isinstance(section, dict) else ():
+            section = section.setdefault(key, {})
+        if isinstance(section, dict):
+            section.setdefault(path[-1], value)
+    return config
+
+
 def new_run_directory(task: str, label: str) -> Path:
-    """Make ``outputs/<task>/<time>-<label>``, numbered where that is taken."""
+    """Make ``outputs/<task>/<time>-<label>``, with a number if that exists."""
     parent = Path("outputs") / task
     parent.mkdir(parents=True, exist_ok=True)
     name = f"{datetime.now():%Y-%m-%d_%H-%M-%S}-{label}"
@@ -94,7 +112,7 @@ def new_run_directory(task: str, label: str) -> Path:
         except FileExistsError:
             continue
         return path
-    raise ConfigError(f"run_dir: {parent / name} and 998 more are taken; name one.")
+    raise ConfigError("run_dir", f"{parent / name} and 998 more are taken; name one.")
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -109,8 +127,8 @@ class MetricsTable:
 
     Args:
         path: the file.
-        rows: how many of its rows to keep, where it exists: those that the checkpoint to resume
-            from knows. The later ones will be earned again.
+        rows: number of rows to keep of an existing file: those before the checkpoint from which the
+            run is resumed. Later rows are computed again.
 
     Examples:
         >>> import tempfile
@@ -132,7 +150,7 @@ class MetricsTable:
             with path.open(newline="") as file:
                 reader = csv.DictReader(file)
                 kept = [row for _, row in zip(range(rows), reader, strict=False)]
-                # Columns that only later rows had come again, in their order, with those rows.
+                # Drop columns of later rows only; they are added again with those rows.
                 columns = reader.fieldnames or []
                 self._columns = [c for c in columns if any(row[c] for row in kept)]
         self._write(kept)

@@ -10,46 +10,57 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.agents import (
-    Batch,
     FlatReplay,
-    Imagination,
     TD3Config,
-    Worlds,
+    act,
     copy_actor,
     copy_twin_qvalue,
     learning_rate_scale,
 )
-from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
-from phihp_torchrl.ranges import check_count, check_not_negative, check_share
+from phihp_torchrl.config import ConfigError, check_count, check_not_negative, check_share
+from phihp_torchrl.imagination import Batch, Rollouts, Worlds
 from phihp_torchrl.tasks import Task
+from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.phases import Phase, register_phase
 from phihp_torchrl.trainers.td3_base import TD3Trainer
+from phihp_torchrl.worlds import make_world
 
 
 @dataclass(frozen=True)
 class RealTD3Config(TD3Config):
-    """TD3 on real steps; its own hyper-parameters are :class:`TD3Config`'s.
+    """Settings of TD3 on real steps, in addition to those of :class:`TD3Config`.
 
     Args:
-        real_steps: real transitions in all.
+        real_steps: total number of real transitions.
         batch_size: transitions in an update.
-        replay_capacity: transitions kept.
+        replay_capacity: transitions kept for replay.
         random_steps: transitions in the replay before the first update; until then actions are
             uniformly random.
         steps_per_update: real steps for each critic update.
-        exploration_noise: std of the noise on actions, in units of the action bounds.
-        decay: the share of the steps, at the end, over which learning rates fall to a twentieth.
+        exploration_noise: std of the noise on actions, in units of the action's half-range.
+        decay: share of the steps, at the end, over which learning rates fall to a twentieth.
         evaluation_interval: real steps between two evaluations.
-        evaluation_episodes: episodes in an evaluation. They are not counted as real steps, and
-            have no say in the training.
+        evaluation_episodes: episodes in an evaluation. They are not counted as real steps and do
+            not affect the training.
+        tau: step τ of the target networks towards the networks, in each update of the actor.
+        value_expansion: number of rewards in the value target; 1, because there is no model.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> RealTD3Config(real_steps=1000, random_steps=100).round_steps
+        4
     """
 
-    real_steps: int = 500_000
-    batch_size: int = 64
+    tau: float = 0.01
+    real_steps: int = 100_000
+    batch_size: int = 128
     replay_capacity: int = 1_000_000
-    random_steps: int = 10_000
-    steps_per_update: int = 1
+    random_steps: int = 2000
+    steps_per_update: int = 2
     exploration_noise: float = 0.1
-    decay: float = 0.0
+    decay: float = 0.3
     evaluation_interval: int = 5000
     evaluation_episodes: int = 10
 
@@ -64,24 +75,27 @@ class RealTD3Config(TD3Config):
             "evaluation_interval",
             "evaluation_episodes",
         )
-        check_not_negative(self, "random_steps", "exploration_noise")
+        check_not_negative(self, "exploration_noise")
+        check_count(self, "random_steps", least=0)
         most = min(self.replay_capacity, self.real_steps)
         if self.random_steps > most:
-            raise ValueError(
-                f"random_steps: expected at most {most}, the lesser of replay_capacity and "
-                f"real_steps, got {self.random_steps}."
+            raise ConfigError(
+                "random_steps",
+                f"expected at most {most}, the lesser of replay_capacity and real_steps, "
+                f"got {self.random_steps}.",
             )
         check_share(self, "decay")
         if self.value_expansion != 1:
-            raise ValueError(
-                "value_expansion: expected 1, for there is no model to carry on with, "
-                f"got {self.value_expansion}."
+            raise ConfigError(
+                "value_expansion",
+                f"expected 1, for there is no model to carry on with, got {self.value_expansion}.",
             )
         for name in ("real_steps", "evaluation_interval"):
             if getattr(self, name) % self.round_steps:
-                raise ValueError(
-                    f"{name}: expected a multiple of steps_per_update * policy_delay = "
-                    f"{self.round_steps}, got {getattr(self, name)}."
+                raise ConfigError(
+                    name,
+                    "expected a multiple of steps_per_update * policy_delay = "
+                    f"{self.round_steps}, got {getattr(self, name)}.",
                 )
 
     @property
@@ -91,20 +105,24 @@ class RealTD3Config(TD3Config):
 
 
 class RealTD3Trainer(TD3Trainer):
-    """Learns actor and critics from one real world, step by step.
+    """Trains actor and critics by TD3 on real steps, the paper's model-free baseline.
 
-    The world is stepped on its tensors, by the function that steps imagined worlds; here it steps
-    the true dynamics, one world from the task's resets. Running out of steps truncates an episode
-    and is never recorded as a termination. The last actor is the one that counts: to choose among
-    actors would take episodes in the real world.
+    The world must be simulated; one world is stepped by the function that steps imagined worlds,
+    from the task's reset box. Reaching the limit of steps truncates an episode and is not recorded
+    as a termination. The result is the last actor, because choosing among actors would need further
+    episodes in the real world.
 
     Args:
         task: the task.
-        config: how.
-        seed: of everything random here but the networks' initial weights, which come from torch's
-            global generator.
-        transitions: real transitions to start the replay with, which an earlier phase has taken.
-        compile: whether to compile the world's steps and the update.
+        config: hyper-parameters.
+        seed: seed of all random numbers but the initial weights of the networks, which come from
+            torch's global generator.
+        world: the simulated world, in any form that :func:`~phihp_torchrl.make_world` accepts.
+        transitions: real transitions of an earlier phase, with which the replay starts.
+        compile: whether to compile the steps of the world and the update.
+
+    Raises:
+        ConfigError: for a world that is not simulated.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -113,7 +131,7 @@ class RealTD3Trainer(TD3Trainer):
         >>> while not trainer.done:
         ...     metrics = trainer.advance()
         >>> trainer.real_steps, trainer.updates
-        (40, 20)
+        (40, 10)
     """
 
     def __init__(
@@ -122,17 +140,22 @@ class RealTD3Trainer(TD3Trainer):
         config: RealTD3Config,
         *,
         seed: int,
+        world: Any = "simulated",
         transitions: Batch | None = None,
         compile: bool = False,
     ) -> None:
-        world = TaskWorldModel(task, HybridDynamics.oracle(task))
-        super().__init__(world, config, seed=seed, compile=compile)
+        real = make_world(task, world)
+        model = real.model()
+        if model is None:
+            raise ConfigError(
+                "world.kind", f"expected a simulated world for this phase, got {real}."
+            )
+        super().__init__(model, config, seed=seed, compile=compile)
         self.config = config
-        # What imagined worlds are stepped with; this one is no imagination, it is the true one.
-        self.world = Imagination(world, self.loss.max_action, task.max_steps, compile=compile)
+        self.world = Rollouts(model, act, task.max_steps, compile=compile)
         given = 0 if transitions is None else len(transitions.reward)
         capacity = min(config.replay_capacity, given + config.real_steps)
-        self.replay = FlatReplay(capacity, task.system.state_dim, task.system.action_dim)
+        self.replay = FlatReplay(capacity, task.state_dim, task.action_dim)
         if transitions is not None:
             self.replay.extend(transitions)
         self.given = given
@@ -199,3 +222,18 @@ class RealTD3Trainer(TD3Trainer):
             "actor": copy_actor(self.task, self.update.actor),
             "qvalue": copy_twin_qvalue(self.task, self.update.critics),
         }
+
+
+def _build(context: Context) -> Phase:
+    config, model = context.config, context.before.get("model")
+    return RealTD3Trainer(
+        context.task,
+        context.settings,
+        seed=config.seed,
+        world=context.world,
+        transitions=None if model is None else model.transitions(),
+        compile=config.compile,
+    )
+
+
+register_phase("td3", RealTD3Config, _build, unit="steps", needs_truth=True)

@@ -1,4 +1,4 @@
-"""What TD3 does in any world, imagined or real: act into a replay, learn from it, be resumed."""
+"""The base of TD3 in imagination and on real steps: acting, learning from replay, checkpoints."""
 
 from __future__ import annotations
 
@@ -10,24 +10,22 @@ from torch import Tensor
 
 from phihp_torchrl.agents import (
     FlatReplay,
-    Imagination,
     TD3Config,
     TD3Update,
-    Worlds,
-    draw_noise,
     make_td3_loss,
 )
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.imagination import Rollouts, Worlds, draw_noise
 
 
 class TD3Trainer:
-    """The base of the trainers by TD3, which say when to act and when to learn.
+    """The base of trainers by TD3; subclasses decide when to act and when to learn.
 
     Args:
-        world_model: the world to learn in, imagined or real.
-        td3: TD3's own hyper-parameters.
-        seed: of everything random here but the networks' initial weights, which come from torch's
-            global generator.
+        world_model: the world to act in, a model or a simulated world.
+        td3: hyper-parameters of TD3.
+        seed: seed of all random numbers but the initial weights of the networks, which come from
+            torch's global generator.
         compile: whether to compile the update.
     """
 
@@ -56,7 +54,7 @@ class TD3Trainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from :meth:`state_dict`."""
+        """Continue from a :meth:`state_dict`."""
         self.update.load_state_dict(state["update"])
         self.replay.load_state_dict(state["replay"])
         self.worlds = Worlds(*state["worlds"])
@@ -65,19 +63,19 @@ class TD3Trainer:
         self.generator.set_state(state["generator"])
 
     def _act(
-        self, world: Imagination, starts: Tensor, *, noise: float, random_fraction: float
+        self, world: Rollouts, starts: Tensor, *, noise: float, random_fraction: float
     ) -> None:
         """Step the worlds with noise on the actor's actions.
 
         Args:
-            world: steps them.
-            starts: where lives that begin meanwhile start, ``[steps, worlds, n]``.
-            noise: std of the noise, in units of the action bounds.
+            world: the rollouts that step the worlds.
+            starts: start states of the episodes that begin meanwhile, ``[steps, worlds, n]``.
+            noise: std of the noise, in units of the action's half-range.
             random_fraction: share of actions that are uniformly random.
         """
         drawn = draw_noise(
             starts,
-            self.loss.max_action,
+            world.bounds,
             std=noise,
             random_fraction=random_fraction,
             generator=self.generator,

@@ -1,0 +1,42 @@
+"""The arguments from which a phase is built."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from phihp_torchrl.tasks import Task
+from phihp_torchrl.trainers.run_config import RunConfig
+from phihp_torchrl.trainers.run_directory import RunDirectory
+from phihp_torchrl.worlds import World
+
+
+@dataclass(frozen=True)
+class Context:
+    """The arguments from which a run builds a phase; see :func:`~phihp_torchrl.register_phase`.
+
+    Args:
+        config: settings of the run.
+        settings: the section of the phase in these settings.
+        task: the task.
+        world: the real world.
+        before: the earlier phases of the run, which are done, by name.
+        directory: directory of the run.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from phihp_torchrl import make_world
+        >>> config, world = RunConfig("pendulum"), make_world("pendulum")
+        >>> section, directory = config.section("model"), RunDirectory("outputs/my-run")
+        >>> context = Context(config, section, world.task, world, {}, directory)
+        >>> context.settings.kind, context.directory.path == Path("outputs/my-run")
+        ('hybrid', True)
+    """
+
+    config: RunConfig
+    settings: Any
+    task: Task
+    world: World
+    before: Mapping[str, Any]
+    directory: RunDirectory

@@ -1,0 +1,172 @@
+"""The last phase: evaluate the agent with its planner and with its actor, save it, show it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from phihp_torchrl.config import check_count
+from phihp_torchrl.deployment import Agent, save_agent
+from phihp_torchrl.evaluation import evaluate, measure_latency, show_episode
+from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
+from phihp_torchrl.trainers.run_config import RunConfig
+from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
+from phihp_torchrl.worlds import World
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Settings of the last phase, in which the trained agent is evaluated.
+
+    Args:
+        episodes: real episodes, from seeds that no training uses.
+        latency_actions: actions whose time is measured, one at a time; 0 for none.
+        video: whether to write a GIF of an episode (needs the extra rendering).
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> EvaluateConfig(episodes=0)
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: episodes: expected a whole number >= 1, got 0.
+    """
+
+    episodes: int = 50
+    latency_actions: int = 200
+    video: bool = True
+
+    def __post_init__(self) -> None:
+        check_count(self, "episodes")
+        check_count(self, "latency_actions", least=0)
+
+
+class NewFile(NamedTuple):
+    """A file or directory for the logger.
+
+    Args:
+        label: its name in the logger.
+        path: path of the file or directory.
+    """
+
+    label: str
+    path: Path
+
+
+class EvaluatePhase:
+    """Evaluates the agent with its planner and with its actor, if it has them; saves and shows it.
+
+    Args:
+        agent: the agent.
+        config: settings of the run.
+        settings: the section of this phase.
+        world: the world in which the agent plays.
+        directory: directory of the run, for agent, pictures and ``evaluation.json``.
+        samples: real steps that were taken to train the agent.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        config: RunConfig,
+        settings: EvaluateConfig,
+        world: World,
+        directory: RunDirectory,
+        samples: int,
+    ) -> None:
+        self.agent = agent
+        self.config = config
+        self.settings = settings
+        self.world = world
+        self.directory = directory
+        self.samples = samples
+        self.results: dict[str, dict[str, Any]] = {}
+        self.new_files: list[NewFile] = []
+        self._steps: list[tuple[str, Agent]] = []
+        if agent.planner is not None:
+            self._steps.append(("planner", agent))
+        if agent.actor is not None:
+            self._steps.append(("actor", agent.actor_alone()))
+        self._finished = False
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Number of finished units of work, and of all units."""
+        return len(self.results) + self._finished, len(self._steps) + 1
+
+    @property
+    def done(self) -> bool:
+        """Whether everything is evaluated, saved and shown."""
+        return self._finished
+
+    def advance(self) -> dict[str, float]:
+        """Evaluate the planner, or else the actor, or else save and show the agent."""
+        self.new_files = []
+        if len(self.results) < len(self._steps):
+            return self._evaluate(*self._steps[len(self.results)])
+        self._save()
+        self._show()
+        self._finished = True
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"results": self.results, "finished": self._finished}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.results = dict(state["results"])
+        self._finished = bool(state["finished"])
+
+    def _evaluate(self, name: str, agent: Agent) -> dict[str, float]:
+        settings, task = self.settings, self.agent.task
+        played = evaluate(agent, task, episodes=settings.episodes, world=self.world)
+        summary = played.summary()
+        if settings.latency_actions:
+            summary |= measure_latency(agent, task, calls=settings.latency_actions).summary()
+        self.results[name] = {**summary, "returns": played.returns.tolist()}
+        return {f"evaluate/{name}/{key}": value for key, value in summary.items()}
+
+    def _save(self) -> None:
+        origin = (self.directory.read_metadata().get("sessions") or [{}])[0]
+        metadata = {
+            "seed": self.config.seed,
+            "commit": origin.get("commit"),
+            "dirty": origin.get("dirty"),
+            "command": origin.get("command"),
+            "samples": self.samples,
+            "config": _public(self.config.to_mapping()),
+            "returns": self.results,
+        }
+        save_agent(self.agent, self.directory.agent, metadata=metadata)
+        write_atomically(self.directory.evaluation, json.dumps(self.results, indent=2) + "\n")
+        label = f"{self.config.task}-{self.config.label}"
+        self.new_files.append(NewFile(label, self.directory.agent))
+
+    def _show(self) -> None:
+        video, place = self.settings.video, self.directory.path
+        for path in show_episode(self.agent, place, world=self.world, video=video):
+            self.new_files.append(NewFile(f"evaluate/{path.stem}{path.suffix}", path))
+
+
+def _public(config: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings without those that matter only on this machine."""
+    private = ("from", "plugins", "logger", "progress", "checkpoint_interval", "keep_checkpoints")
+    return {key: value for key, value in config.items() if key not in private}
+
+
+def _build(context: Context) -> Phase:
+    parts: dict[str, Any] = {}
+    for phase in context.before.values():
+        parts |= getattr(phase, "parts", dict)()
+    config, agent = context.config, parts.get("agent")
+    if agent is None:
+        agent = Agent(context.task, **parts, planner_config=config.planner, compile=config.compile)
+    samples = real_steps(context.before)
+    return EvaluatePhase(agent, config, context.settings, context.world, context.directory, samples)
+
+
+register_phase("evaluate", EvaluateConfig, _build, unit="parts")

@@ -1,0 +1,30 @@
+"""The result of a finished run, read from its directory."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from phihp_torchrl.config import METHODS
+from phihp_torchrl.evaluation import TaskResult
+from phihp_torchrl.trainers.run_directory import RunDirectory
+
+
+def read_result(path: Path) -> TaskResult | None:
+    """Read the returns of the agent of the run in ``path``; ``None`` if it was not evaluated.
+
+    Raises:
+        ConfigError: if there is no run in ``path``.
+    """
+    directory = RunDirectory(path)
+    if not directory.evaluation.is_file():
+        return None
+    results, config = json.loads(directory.evaluation.read_text()), directory.read_config()
+    means = {name: (result["return_mean"],) for name, result in results.items()}
+    samples = directory.read_metadata()["real_steps"]
+    method = METHODS.get(config.get("method", "phihp"))
+    label = config["method"] if method is None else method.label
+    world = (config.get("world") or {}).get("kind", "simulated")
+    # Targets and published returns are for simulated worlds only.
+    task = config["task"] if world == "simulated" else f"{config['task']} in {world}"
+    return TaskResult(task, samples, label=label, **means)
