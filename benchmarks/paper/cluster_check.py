@@ -29,7 +29,7 @@ from report import ReportConfig, make_report
 TASKS, SEEDS, SHARE = ("pendulum", "cartpole"), range(6), 0.05
 CELLS = len(TASKS) * len(SEEDS)
 
-# The least that the phases can do; the tests of the other recipes take it too.
+# The least that the phases can do; the tests of the commands take it too.
 TINY = (
     "compile=false",
     "evaluate.episodes=2",

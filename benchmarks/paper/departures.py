@@ -26,11 +26,12 @@ import yaml
 
 from measures import PUBLISHED_SAMPLES, paired_difference, prediction_errors
 from model_error import model_config
-from phihp_torchrl import get_task
+from phihp_torchrl import load_config
+from phihp_torchrl.config import flatten, override_lines
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.trainers import ModelTrainer
-from recipe_configs import RECIPES, settings
+from phihp_torchrl.worlds import SimulatedWorld
 
 RESULTS = Path("results/departures")
 TASKS = ("pendulum-swingup", "acrobot", "cartpole-swingup")
@@ -52,33 +53,46 @@ NOISE = "seed"
 """In the place of a key: the same settings with another seed, to compare the effects with."""
 
 
+@cache
+def settings(task: str, preset: str) -> dict[str, Any]:
+    """Value of every key of a preset on a task."""
+    return flatten(load_config(task, preset=preset))
+
+
 def departures(task: str) -> dict[str, Any]:
     """The published value of every key to measure in which the default departs on a task."""
-    paper, ours = settings("paper"), settings("default")
+    paper, ours = settings(task, "paper"), settings(task, "default")
     return {
-        key: paper[key][task]
+        key: paper[key]
         for key in ours
         if key.split(".")[0] in ("model", *PHASES)
         and key not in LEFT_OUT
-        and paper[key][task] != ours[key][task]
+        and paper[key] != ours[key]
         and ELSEWHERE.get(key, task) == task
     }
 
 
+def changes(task: str, key: str) -> list[str]:
+    """The words that set ``key``, and what belongs to it, to its published value."""
+    paper = settings(task, "paper")
+    return override_lines({name: paper[name] for name in (key, *TOGETHER.get(key, ()))})
+
+
 @cache
-def model_error(task: str, changes: tuple[str, ...] = ()) -> float:
-    """Median 20-step error, from the wide box, of a model of the default preset but for changes."""
+def model_error(task: str, words: tuple[str, ...] = ()) -> float:
+    """Median 20-step error, from the wide box, of a model of the default preset but for words."""
     torch.manual_seed(0)
-    trainer = ModelTrainer(get_task(task), model_config(task, *changes), seed=0)
+    world = SimulatedWorld(task)
+    trainer = ModelTrainer(world.task, model_config(task, *words), seed=0, world=world)
     while not trainer.done:
         trainer.advance()
-    return prediction_errors(get_task(task), trainer.dynamics)["coverage_median"]
+    return prediction_errors(world, trainer.dynamics)["coverage_median"]
 
 
-def rerun(task: str, section: str, changes: list[str], base: Path, out: Path) -> dict[str, Any]:
-    """What the changes do to the returns of the run ``base``, over the same episodes."""
+def rerun(task: str, section: str, words: list[str], base: Path, out: Path) -> dict[str, Any]:
+    """What the words do to the returns of the run ``base``, over the same episodes."""
     steps = yaml.safe_load((base / "config.yaml").read_text())["model"]["real_steps"]
-    command = [sys.executable, str(RECIPES / "phihp.py"), f"task={task}", *changes, *QUIET]
+    command = [sys.executable, "-m", "phihp_torchrl", "train", f"task={task}", *words, *QUIET]
     command += [f"phases={PHASES[section]}", f"from={base}", f"run_dir={out}"]
     subprocess.run([*command, f"model.real_steps={steps}"], check=True)
     effects = {}
@@ -100,12 +114,11 @@ def measure(task: str, key: str, base: Path, out: Path) -> dict[str, Any]:
     """The effect of the published value of ``key``, or of another seed."""
     if key == NOISE:
         return {"value": 1, **rerun(task, "policy", ["seed=1"], base, out)}
-    paper, section = settings("paper"), key.split(".")[0]
-    changes = [f"{name}={override(paper[name][task])}" for name in (key, *TOGETHER.get(key, ()))]
-    value = paper[key][task]
+    section, value = key.split(".")[0], settings(task, "paper")[key]
+    words = changes(task, key)
     if section != "model":
-        return {"value": value, **rerun(task, section, changes, base, out)}
-    errors = {"error": model_error(task, tuple(changes)), "default_error": model_error(task)}
+        return {"value": value, **rerun(task, section, words, base, out)}
+    errors = {"error": model_error(task, tuple(words)), "default_error": model_error(task)}
     return {"value": value, **errors}
 
 
@@ -141,11 +154,6 @@ def write(entries: dict[str, dict[str, Any]]) -> None:
         "policy of another seed: smaller effects than its are not told from chance.\n\n"
         + markdown_table(["key", "value", "published less default", "made at"], rows)
     )
-
-
-def override(value: Any) -> str:
-    """As Hydra's command line takes it."""
-    return yaml.safe_dump(value, default_flow_style=True).split("\n")[0]
 
 
 def main() -> None:

@@ -16,8 +16,8 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-import recipe_configs  # noqa: F401  (config/report.yaml asks it for the recipes' directory)
-from phihp_torchrl.trainers import ConfigError, LoggerConfig, from_mapping, make_logger
+from phihp_torchrl.config import ConfigError, from_mapping
+from phihp_torchrl.trainers import LoggerConfig, make_logger
 from report import Report, ReportConfig, make_report
 
 

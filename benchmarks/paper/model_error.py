@@ -18,28 +18,27 @@ import torch
 from tensordict import TensorDict
 
 from measures import PREDICTION_EPISODES, PREDICTION_STEPS, PUBLISHED_SAMPLES, prediction_errors
-from phihp_torchrl import HybridDynamics, Task, get_task
+from phihp_torchrl import HybridDynamics, get_task, load_config
 from phihp_torchrl.dynamics import DynamicsLoss, PhysicsPrior, fit, split
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
-from phihp_torchrl.trainers import ModelConfig, ModelTrainer, make_dynamics
-from recipe_configs import compose_request
+from phihp_torchrl.trainers import ModelConfig, ModelTrainer, make_dynamics, read_run_config
+from phihp_torchrl.worlds import SimulatedWorld
 
 RESULTS = Path("results/model_error")
 
 
 def model_config(task: str, *changes: str) -> ModelConfig:
     """The default preset's phase 1, but for changes as on the command line."""
-    config = compose_request("phihp", [f"task={task}", *changes]).config.model
-    assert config is not None  # PhIHP has a model
-    return config
+    return read_run_config(load_config(task, overrides=changes)).section("model")
 
 
 def compare(name: str, seed: int) -> dict[str, object]:
     """Collect once, fit both models to it."""
     task, config = get_task(name), model_config(name)
+    world = SimulatedWorld(task)
     torch.manual_seed(seed)
-    trainer = ModelTrainer(task, config, seed=seed)
+    trainer = ModelTrainer(task, config, seed=seed, world=world)
     while not trainer.done:
         trainer.advance()
     constants = {}
@@ -47,7 +46,7 @@ def compare(name: str, seed: int) -> dict[str, object]:
         guess = PhysicsPrior(task.system)
         guess.load_state_dict({"log_constants": trainer.initial["prior.log_constants"]})
         for label, values in (
-            ("truth", task.system.constants),
+            ("truth", world.truth.constants),
             ("guess", guess.constants()),
             ("identified", trainer.dynamics.prior.constants()),
         ):
@@ -57,17 +56,19 @@ def compare(name: str, seed: int) -> dict[str, object]:
         "task": name,
         "seed": seed,
         "real_steps": trainer.real_steps,
-        "hybrid": prediction_errors(task, trainer.dynamics),
-        "data_driven": prediction_errors(task, fit_data_driven(task, config, trainer.data, seed)),
+        "hybrid": prediction_errors(world, trainer.dynamics),
+        "data_driven": prediction_errors(world, fit_data_driven(world, config, trainer.data, seed)),
         "constants": constants,
         "origin": origin_text(describe_origin(seed)),
     }
 
 
-def fit_data_driven(task: Task, config: ModelConfig, data: TensorDict, seed: int) -> HybridDynamics:
+def fit_data_driven(
+    world: SimulatedWorld, config: ModelConfig, data: TensorDict, seed: int
+) -> HybridDynamics:
     """The same transition without prior, from the same data, by the same method."""
     torch.manual_seed(seed)
-    dynamics = make_dynamics(task, replace(config, kind="data_driven"))
+    dynamics = make_dynamics(world, replace(config, kind="data_driven"))
     train, held_out, _ = split(data)
     generator = torch.Generator().manual_seed(seed)
     fit(DynamicsLoss(dynamics), train, held_out, config.fit, generator)
@@ -77,7 +78,8 @@ def fit_data_driven(task: Task, config: ModelConfig, data: TensorDict, seed: int
 def write_tables() -> None:
     """The tables of all tasks compared so far."""
     results = [json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))]
-    results.sort(key=lambda result: list(PUBLISHED_SAMPLES).index(result["task"]))
+    order = {task: i for i, task in enumerate(PUBLISHED_SAMPLES)}
+    results.sort(key=lambda result: order.get(result["task"], len(order)))
     errors, constants = [], []
     origins = "; ".join(f"{r['task']}, {r.get('origin', 'not recorded')}" for r in results)
     for result in results:

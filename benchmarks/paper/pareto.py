@@ -15,7 +15,8 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -25,13 +26,13 @@ from matplotlib.figure import Figure
 from tensordict import TensorDict
 
 from measures import PairedDifference, paired_difference
-from phihp_torchrl import CEMPlanner, load_agent
+from phihp_torchrl import load_agent, load_config
+from phihp_torchrl.config import read_kind
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.evaluation import EVALUATION_SEED, TARGETS, evaluate, markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
-from phihp_torchrl.planners.factory import PlannerConfig, make_planner
-from recipe_configs import settings
+from phihp_torchrl.planners import PLANNERS, CEMConfig, SamplingPlanner, make_planner
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/pareto")
 TURN = 10  # actions of a planner before the next one's
@@ -69,18 +70,21 @@ OURS = {
 }
 
 
-def planner_config(task: str, name: str) -> PlannerConfig:
+def planner_config(task: str, name: str) -> CEMConfig:
     """The published planner of the task; for our budgets the default preset's, with changes."""
-    preset, section = settings("paper" if name == PUBLISHED else "default"), "planner."
-    own = {
-        key.removeprefix(section): values[task]
-        for key, values in preset.items()
-        if key.startswith(section)
-    }
-    return PlannerConfig(**own if name == PUBLISHED else {**own, **OURS, **BUDGETS[name]})
+    if name == PUBLISHED:
+        return preset_planner(task, "paper")
+    changes: dict[str, Any] = {**OURS, **BUDGETS[name]}
+    return replace(preset_planner(task, "default"), **changes)
 
 
-def build(agent: Agent, name: str, compile: bool = False) -> CEMPlanner:
+@cache
+def preset_planner(task: str, preset: str) -> CEMConfig:
+    """The planner of a preset on a task."""
+    return read_kind(PLANNERS, load_config(task, preset=preset)["planner"], "planner")
+
+
+def build(agent: Agent, name: str, compile: bool = False) -> SamplingPlanner:
     """The planner of a budget."""
     assert agent.dynamics is not None  # agents of PhIHP
     model = TaskWorldModel(agent.task, agent.dynamics)
@@ -95,7 +99,7 @@ def latencies(planners: dict, agent: Agent, calls: int) -> dict[str, float]:
     """
     states = (agent.task.coverage or agent.task.reset).sample([calls])
     times: dict[str, list[float]] = {name: [] for name in planners}
-    for turn in agent.task.system.observe(states).split(TURN):
+    for turn in agent.task.observe(states).split(TURN):
         for name, planner in planners.items():
             data = [TensorDict(observation=o, is_init=torch.tensor([True])) for o in turn]
             start = time.thread_time()

@@ -20,7 +20,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from grid import GridConfig, work
-from phihp_torchrl.trainers import ConfigError, from_mapping
+from phihp_torchrl.config import ConfigError, from_mapping
 
 
 @hydra.main(version_base="1.3", config_path="config", config_name="grid")

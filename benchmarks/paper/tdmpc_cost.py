@@ -13,14 +13,13 @@ import argparse
 import time
 from collections.abc import Callable
 from statistics import median
-from typing import Any
 
 import torch
 from tensordict import TensorDict
 
-from phihp_torchrl import get_task
-from phihp_torchrl.trainers import TDMPCTrainConfig, TDMPCTrainer
-from recipe_configs import compose_request
+from phihp_torchrl import get_task, load_config
+from phihp_torchrl.tdmpc import TDMPCTrainConfig, TDMPCTrainer
+from phihp_torchrl.trainers import read_run_config
 
 PRESETS = ("paper", "default")
 
@@ -57,18 +56,16 @@ def prepare(
     task_name: str, preset: str, compile: bool
 ) -> tuple[TDMPCTrainConfig, Callable[[], object], Callable[[], object]]:
     """A preset's settings, an update and a plan, with 2,000 random steps in replay."""
-    overrides = [f"task={task_name}", f"preset={preset}", "tdmpc.seed_steps=2000"]
-    section = compose_request("tdmpc", overrides).config.tdmpc
-    assert section is not None  # the method is TD-MPC
+    overrides = {"tdmpc.seed_steps": 2000}
+    settings = load_config(task_name, method="td-mpc", preset=preset, overrides=overrides)
+    section = read_run_config(settings).section("tdmpc")
     task = get_task(task_name)
     trainer = TDMPCTrainer(task, section, seed=0, compile=compile)
     while trainer.updates_due < 1:
         trainer.advance()
-    agent = trainer.agent()
     # A plan as it is in the end, with its full horizon.
-    planner: Any = agent.planner  # MPPI, which has settings of its own kind
-    planner.settings = section.planner.at(section.planner.schedule_steps)
-    observation = TensorDict(observation=task.system.observe(task.reset.sample([])))
+    agent = trainer.agent().with_planner(section.planner.at(section.planner.schedule_steps))
+    observation = TensorDict(observation=task.observe(task.reset.sample([])))
     return (
         section,
         lambda: trainer.update(trainer.replay.sample(), generator=trainer.generator),

@@ -14,11 +14,20 @@ from tensordict import TensorDict
 from phihp_torchrl import HybridDynamics, Task
 from phihp_torchrl.agents import make_actor, make_twin_qvalue
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.planners.factory import PlannerConfig, make_planner
+from phihp_torchrl.planners import CEMConfig, make_planner
 from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import Box
 
-CONFIG = PlannerConfig(compare_with_actor=False)
+# The published budget (SPEC section 4).
+CONFIG = CEMConfig(
+    planning_horizon=5,
+    optim_steps=3,
+    num_candidates=220,
+    top_k=10,
+    policy_noise=0.05,
+    policy_noise_clip=0.3,
+    compare_with_actor=False,
+)
 CURVES = {
     "candidates": (32, 64, 128, 256, 512, 1024),
     "horizon": (1, 2, 5, 10, 20, 40),
@@ -66,7 +75,7 @@ def contender(quantity, value):
     batch = [value if quantity == "batch of plans" else 1]
     model = TaskWorldModel(task, HybridDynamics.hybrid(task))
     planner = make_planner(model, actor, qvalue, config)
-    observation = task.system.observe(task.reset.sample(batch))
+    observation = task.observe(task.reset.sample(batch))
     data = TensorDict(observation=observation, batch_size=batch)
     return lambda: planner(data.clone())
 

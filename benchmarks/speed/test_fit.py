@@ -10,6 +10,7 @@ from tensordict import TensorDict
 
 from phihp_torchrl import HybridDynamics, get_task
 from phihp_torchrl.dynamics import DynamicsLoss, FitConfig, fit, perturbed_constants
+from phihp_torchrl.worlds import SimulatedWorld
 
 SAMPLES = 2500
 EPOCHS, MEASURED = 12_000, 100  # the published fits: 4,000 epochs of 3 steps
@@ -17,17 +18,18 @@ EPOCHS, MEASURED = 12_000, 100  # the published fits: 4,000 epochs of 3 steps
 
 def test_fit(benchmark, report):
     task = get_task("pendulum-swingup")
+    world = SimulatedWorld(task)
     state = task.coverage.sample([SAMPLES])
     action = 4 * torch.rand(SAMPLES, 1) - 2
-    observe = task.system.observe
+    following = task.observe(world.step(state, action))
     data = TensorDict(
-        observation=observe(state),
+        observation=task.observe(state),
         action=action,
-        next=TensorDict(observation=observe(task.step(state, action)), batch_size=[SAMPLES]),
+        next=TensorDict(observation=following, batch_size=[SAMPLES]),
         batch_size=[SAMPLES],
     )
     train, held_out = data[:-250], data[-250:]
-    constants = perturbed_constants(task.system, 0.3, torch.Generator().manual_seed(0))
+    constants = perturbed_constants(world.truth.constants, 0.3, torch.Generator().manual_seed(0))
     untrained = DynamicsLoss(
         HybridDynamics.hybrid(task, constants=constants, activation=torch.nn.Tanh)
     )

@@ -10,8 +10,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule
 
 from phihp_torchrl import HybridDynamics, WorldModelEnv, get_task
-from phihp_torchrl.agents import Actor, Imagination, Worlds, draw_noise
+from phihp_torchrl.agents import Actor, act
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.imagination import Rollouts, Worlds, draw_noise
 
 
 @pytest.mark.parametrize(("worlds", "steps"), [(64, 4), (1, 2)])
@@ -23,12 +24,12 @@ def test_transitions(benchmark, report, worlds, steps):
     places = Worlds(task.reset.sample([worlds]), torch.zeros(worlds, dtype=torch.int64))
 
     def imagines(compile):
-        imagination = Imagination(model, actor.action_high, task.max_steps, compile=compile)
+        rollouts = Rollouts(model, act, task.max_steps, compile=compile)
 
         def call():
             starts = task.coverage.sample([steps, worlds])
-            noise = draw_noise(starts, actor.action_high, std=0.1, random_fraction=0.1)
-            imagination.chunk(layers, places, noise)
+            noise = draw_noise(starts, task.bounds, std=0.1, random_fraction=0.1)
+            rollouts.chunk(layers, places, noise)
 
         return call
 

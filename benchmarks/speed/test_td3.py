@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from race import backward, forward, layers_of, products, race
+from stock_td3 import StockTD3Update
 
 from phihp_torchrl import HybridDynamics, get_task
-from phihp_torchrl.agents import Batch, StockTD3Update, TD3Config, TD3Update, make_td3_loss
+from phihp_torchrl.agents import TD3Config, TD3Update, make_td3_loss
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.imagination import Batch
 
 ACTOR, CRITIC = [3, 300, 300, 1], [4, 200, 200, 200, 1]
 

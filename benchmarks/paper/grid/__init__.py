@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from grid.cell import Cell, CellFiles
 from grid.claim import claim, is_claimed
-from grid.config import GridConfig, MethodConfig
+from grid.config import GridConfig
 from grid.keep import keep
 from grid.live import LiveTable
 from grid.status import CellState, Status, look
@@ -17,7 +17,6 @@ __all__ = [
     "CellState",
     "GridConfig",
     "LiveTable",
-    "MethodConfig",
     "Status",
     "claim",
     "is_claimed",

@@ -6,6 +6,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from phihp_torchrl.config import ConfigError
+
 DEFAULT_METHOD = "phihp"
 """The method whose name the cells' names leave out."""
 
@@ -24,7 +26,7 @@ class Cell:
         label: name of its settings, so that a grid can have several.
 
     Raises:
-        ValueError: for a name that cannot be part of a file's.
+        ConfigError: for a name that cannot be part of a file's.
 
     Examples:
         >>> Cell("phihp", "acrobot", 0, 2500).name
@@ -43,7 +45,7 @@ class Cell:
         for key in ("method", "task", "label"):
             value = getattr(self, key)
             if not _FILE_NAME.fullmatch(value):
-                raise ValueError(f"{key}: expected letters, digits, '.', '_', '-', got {value!r}.")
+                raise ConfigError(key, f"expected letters, digits, '.', '_', '-', got {value!r}.")
 
     @property
     def name(self) -> str:

@@ -8,24 +8,15 @@ from pathlib import Path
 
 from grid.cell import Cell, CellFiles
 from measures import PUBLISHED_SAMPLES
+from phihp_torchrl.config import (
+    ConfigError,
+    check_count,
+    check_not_negative,
+    get_method,
+    override_lines,
+)
 from phihp_torchrl.evaluation import check_training_seed
-from phihp_torchrl.ranges import check_count, check_not_negative
-
-
-@dataclass(frozen=True)
-class MethodConfig:
-    """How a method is run.
-
-    Args:
-        recipe: the recipe whose configuration it is.
-        overrides: what makes the recipe this method.
-        samples_key: the key that takes the number of real samples; ``None`` for a method that
-            keeps its own budget whatever ``share`` is.
-    """
-
-    recipe: str
-    overrides: tuple[str, ...] = ()
-    samples_key: str | None = None
+from phihp_torchrl.trainers import import_plugins
 
 
 @dataclass(frozen=True)
@@ -33,12 +24,12 @@ class GridConfig:
     """A cell of the grid; ``config/grid.yaml`` mirrors it.
 
     Args:
-        method: one of ``methods``.
+        method: name of a registered method.
         task: name of a task.
         seed: of everything random in the run.
-        share: real samples, as a share of the published number; ``None`` for the recipe's own.
+        share: real samples, as a share of the published number; ``None`` for the preset's own.
         label: name of the settings.
-        overrides: settings that all cells have, as on the recipe's command line.
+        overrides: settings that all cells have, as on the command line of ``phihp train``.
         retry_failed: whether to try cells again that ended with an error.
         runs: directory of the runs in full.
         results: directory of what is kept of finished runs.
@@ -46,10 +37,11 @@ class GridConfig:
             may do for a moment.
         jobs: runs at a time, for the launcher ``joblib``.
         refresh: seconds between two looks at the grid; 0 for no table.
-        methods: how each method is run.
+        method_overrides: settings that the grid gives a method besides its own, by method.
+        plugins: Python files or modules to import, which register tasks, methods and the like.
 
     Raises:
-        ValueError: for a value that is unknown or out of range, by its key.
+        ConfigError: for a value that is unknown or out of range, by its key.
     """
 
     method: str
@@ -64,37 +56,41 @@ class GridConfig:
     claim_wait: float = 10.0
     jobs: int = 2
     refresh: float = 2.0
-    methods: Mapping[str, MethodConfig] = field(default_factory=dict)
+    method_overrides: Mapping[str, tuple[str, ...]] = field(default_factory=dict, hash=False)
+    plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.method not in self.methods:
-            raise ValueError(
-                f"method: expected one of {sorted(self.methods)}, got {self.method!r}."
-            )
+        import_plugins(self.plugins)
+        get_method(self.method)
         check_training_seed(self.seed)
         if self.share is not None and not self.share > 0:
-            raise ValueError(f"share: expected a positive number or null, got {self.share}.")
+            raise ConfigError("share", f"expected a positive number or null, got {self.share}.")
         check_count(self, "jobs")
         check_not_negative(self, "claim_wait", "refresh")
         self.cell()
 
-    @property
-    def how(self) -> MethodConfig:
-        """How the cell's method is run."""
-        return self.methods[self.method]
+    def words(self) -> list[str]:
+        """The settings of the cell's run, but for its place, as on a command line."""
+        cell, samples_key = self.cell(), get_method(self.method).samples_key
+        lines = [f"task={cell.task}", f"method={cell.method}", f"seed={cell.seed}"]
+        lines += ["progress=false", *override_lines({"plugins": self.plugins})]
+        if cell.samples is not None:
+            lines.append(f"{samples_key}={cell.samples}")
+        return [*lines, *self.method_overrides.get(self.method, ()), *self.overrides]
 
     def cell(self) -> Cell:
         """The cell.
 
         Raises:
-            ValueError: if ``share`` is of a task that has no published number of samples.
+            ConfigError: if ``share`` is of a task that has no published number of samples.
         """
         samples = None
-        if self.share is not None and self.how.samples_key is not None:
+        if self.share is not None and get_method(self.method).samples_key is not None:
             if self.task not in PUBLISHED_SAMPLES:
-                raise ValueError(
-                    f"share: expected null for {self.task!r}, of which no number of samples is "
-                    f"published, got {self.share}."
+                raise ConfigError(
+                    "share",
+                    f"expected null for {self.task!r}, of which no number of samples is "
+                    f"published, got {self.share}.",
                 )
             samples = round(PUBLISHED_SAMPLES[self.task] * self.share)
         return Cell(self.method, self.task, self.seed, samples, self.label)

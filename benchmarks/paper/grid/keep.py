@@ -12,7 +12,8 @@ from pathlib import Path
 
 from grid.cell import CellFiles
 from measures import curve_from_metrics, prediction_errors, write_curve
-from phihp_torchrl.deployment import load_agent
+from phihp_torchrl.deployment import Agent, load_agent
+from phihp_torchrl.worlds import SimulatedWorld, make_world
 
 _log = logging.getLogger(__name__)
 
@@ -54,13 +55,23 @@ def _keep_prediction(files: CellFiles) -> None:
     if not (files.run / "agent").is_dir():
         return
     try:
-        agent = load_agent(files.run / "agent")
-        errors = {} if agent.dynamics is None else prediction_errors(agent.task, agent.dynamics)
+        errors = _prediction_errors(load_agent(files.run / "agent"))
     except Exception as error:  # a finished run must not be lost to an afterthought
         _log.warning("%s: its model's predictions were not measured: %s", files.run, error)
         return
     (files.run / PREDICTION).write_text(json.dumps(errors, indent=2) + "\n")
     _replace(files.run / PREDICTION, files.kept / PREDICTION)
+
+
+def _prediction_errors(agent: Agent) -> dict[str, float]:
+    """None for an agent without a model, and in a world whose truth nobody knows."""
+    settings = (agent.metadata.get("config") or {}).get("world") or "simulated"
+    kind = settings if isinstance(settings, str) else settings.get("kind")
+    if agent.dynamics is None or kind != SimulatedWorld.kind:
+        return {}
+    world = make_world(agent.task, settings)
+    assert isinstance(world, SimulatedWorld)  # by its kind
+    return prediction_errors(world, agent.dynamics)
 
 
 def _replace(source: Path, target: Path) -> None:

@@ -14,7 +14,7 @@ from grid.cell import CellFiles
 from grid.display import failures, summary, table
 from grid.status import CellState, Status, look
 from grid.sweep import swept_cells
-from phihp_torchrl.trainers import ConfigError
+from phihp_torchrl.config import ConfigError
 
 
 class LiveTable(Callback):

@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-
 from grid.cell import CellFiles
 from grid.config import GridConfig
-from phihp_torchrl.trainers import from_mapping
+from phihp_torchrl.config import from_mapping, override_key, parse_overrides
 
 
 def swept_cells(base: Mapping[str, Any], overrides: Sequence[str], root: Path) -> list[CellFiles]:
@@ -25,10 +23,8 @@ def swept_cells(base: Mapping[str, Any], overrides: Sequence[str], root: Path) -
     Raises:
         ConfigError: for the first cell with a wrong value, by its key.
     """
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    sweeps = {
-        str(o.key_or_group): list(o.sweep_iterator()) for o in parsed if o.is_sweep_override()
-    }
+    parsed = parse_overrides(overrides)
+    sweeps = {override_key(o): list(o.sweep_iterator()) for o in parsed if o.is_sweep_override()}
     cells = []
     for values in itertools.product(*sweeps.values()):
         chosen = {key: _plain(value) for key, value in zip(sweeps, values, strict=True)}

@@ -20,8 +20,8 @@ from grid.claim import claim
 from grid.config import GridConfig
 from grid.keep import is_whole, keep
 from grid.status import CellState, Status, look
-from phihp_torchrl.trainers import RunRequest, run
-from recipe_configs import compose_request
+from phihp_torchrl.config import compose_yaml, override_lines
+from phihp_torchrl.trainers import RunRequest, read_request, run
 
 _log = logging.getLogger(__name__)
 _LOGGERS = ("phihp_torchrl", "grid")
@@ -81,31 +81,23 @@ def _run(config: GridConfig, files: CellFiles) -> None:
 
 
 def _request(config: GridConfig, files: CellFiles) -> RunRequest:
-    """What ``python recipes/<recipe>.py`` would be asked for."""
-    cell, how = files.cell, config.how
-    lines = [f"task={cell.task}", f"seed={cell.seed}", "progress=false"]
-    if cell.samples is not None:
-        lines.append(f"{how.samples_key}={cell.samples}")
-    # Overrides hold for a resumed run too, which refuses to be another one than it was.
-    lines += [*how.overrides, *config.overrides]
-    if (files.run / "config.yaml").is_file():
-        lines.append(f"resume={_quoted(files.run)}")
-    else:
+    """What ``phihp train`` would be asked for.
+
+    The words hold for a resumed run too, which refuses to be another one than it was.
+    """
+    place = "resume"
+    if not (files.run / "config.yaml").is_file():
         # Killed before its first file was whole: there is nothing to lose in it.
         shutil.rmtree(files.run, ignore_errors=True)
-        lines.append(f"run_dir={_quoted(files.run)}")
+        place = "run_dir"
+    words = [*config.words(), *override_lines({place: str(files.run)})]
     with _no_hydra():
-        return compose_request(how.recipe, lines)
-
-
-def _quoted(path: Path) -> str:
-    text = str(path).replace("\\", "\\\\").replace("'", "\\'")
-    return f"'{text}'"
+        return read_request(compose_yaml(words), words)
 
 
 @contextmanager
 def _no_hydra() -> Iterator[None]:
-    """Hydra knows one application at a time: set the grid's aside while a recipe's is composed."""
+    """Hydra knows one application at a time: set the grid's aside while a run's is composed."""
     instance = GlobalHydra.instance()
     outer = instance.hydra
     instance.clear()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from report.bounds import BOUNDS, Bounds, normalise
 from report.build import Report, ReportConfig, make_report
 from report.efficiency import samples_to_90
-from report.paper_systems import SYSTEMS, PaperSystem
+from report.paper_systems import PaperSystem, system, systems
 from report.results import Results, Score
 from report.runs import Acting, Run, RunFolders, read_run, read_runs
 from report.sections import Picture, Section
@@ -16,7 +16,6 @@ from report.tables import NOT_RUN, Number, Stat, Table
 __all__ = [
     "BOUNDS",
     "NOT_RUN",
-    "SYSTEMS",
     "Acting",
     "Bounds",
     "Number",
@@ -39,6 +38,8 @@ __all__ = [
     "read_runs",
     "read_trials",
     "samples_to_90",
+    "system",
+    "systems",
     "welch",
     "write_trials",
 ]

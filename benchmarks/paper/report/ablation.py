@@ -8,18 +8,18 @@ from itertools import product
 
 from matplotlib.figure import Figure
 
+from report.bounds import BOUNDS
 from report.efficiency import sample_efficiency
-from report.paper_systems import ABLATIONS, PHIHP, PaperSystem
+from report.paper_systems import PaperSystem, systems
 from report.results import SIX_TASKS, Results
 from report.sections import Picture, Section
 from report.tables import Stat, Table, TableCell
 
-_SYSTEMS = (PHIHP, *ABLATIONS)
-
 
 def ablation(results: Results) -> Section:
     """Bars over the tasks that all systems which were run have in common, and a table of all."""
-    run = [s for s in _SYSTEMS if any(results.has_run(s, task) for task in SIX_TASKS)]
+    compared = systems("ours", "ablation")
+    run = [s for s in compared if any(results.has_run(s, task) for task in SIX_TASKS)]
     common = [task for task in SIX_TASKS if run and all(results.has_run(s, task) for s in run)]
     metrics: dict[str, Callable[[PaperSystem, str], Sequence[float]]] = {
         "normalised return": lambda s, t: [x.normalised for x in results.usual(s, t)],
@@ -28,22 +28,23 @@ def ablation(results: Results) -> Section:
             x.milliseconds for x in results.usual(s, t) if x.milliseconds is not None
         ],
     }
-    missing = [system.name for system in _SYSTEMS if system not in run]
+    missing = [system.name for system in compared if system not in run]
     shared = ", ".join(common) or "no task, for none is shared"
     text = f"Bars: mean ± std over the runs on {shared}."
     if missing:
         text += f" Not run: {', '.join(missing)}."
     digits = (3, 0, 2)
     rows: list[list[TableCell]] = []
-    for task, system in product(SIX_TASKS, _SYSTEMS):
-        stats = [
-            Stat(tuple(values(system, task)), n)
-            for values, n in zip(metrics.values(), digits, strict=True)
+    for task, system in product((*SIX_TASKS, *results.others), compared):
+        stats: list[TableCell] = [
+            # Returns of a task without bounds are on no scale.
+            "–" if i == 0 and task not in BOUNDS else Stat(tuple(values(system, task)), n)
+            for i, (values, n) in enumerate(zip(metrics.values(), digits, strict=True))
         ]
         rows.append([f"{task}, {system.name}", *stats])
     figure = Figure(figsize=(11.0, 3.4), layout="constrained")
     for axis, (name, values) in zip(figure.subplots(1, len(metrics)), metrics.items(), strict=True):
-        for x, system in enumerate(_SYSTEMS):
+        for x, system in enumerate(compared):
             stat = Stat(tuple(v for task in common for v in values(system, task)))
             if system in run and stat.values:
                 columns = stat.columns()
@@ -52,7 +53,7 @@ def ablation(results: Results) -> Section:
             else:
                 axis.text(x, 0.05, "not run", rotation=90, ha="center", va="bottom",
                           transform=axis.get_xaxis_transform())  # fmt: skip
-        names = [system.name for system in _SYSTEMS]
+        names = [system.name for system in compared]
         axis.set_xticks(range(len(names)), names, rotation=30, fontsize="small")
         axis.set_xlim(-0.6, len(names) - 0.4)
         axis.set_title(name)

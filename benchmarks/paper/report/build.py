@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from phihp_torchrl.ranges import check_count
+from phihp_torchrl.config import check_count
+from phihp_torchrl.trainers import import_plugins
 from report.ablation import ablation
 from report.claims import claims_section
 from report.curves import imagined_curves, learning_curves
@@ -38,6 +39,7 @@ class ReportConfig:
         reps: resamples of the bootstrap.
         overview: page with PhIHP's tables for every label; ``None`` for none.
         page: page with the table of returns between its markers; ``None`` for none.
+        plugins: Python files or modules to import, which register tasks and methods.
     """
 
     runs: str = "results/runs"
@@ -49,6 +51,7 @@ class ReportConfig:
     reps: int = 2000
     overview: str | None = "results/README.md"
     page: str | None = "README.md"
+    plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_count(self, "reps")
@@ -74,6 +77,7 @@ def make_report(config: ReportConfig) -> Report:
     Args:
         config: from where and to where.
     """
+    import_plugins(config.plugins)
     folders = read_runs(Path(config.runs), any_version=config.any_version)
     trials, unread = read_trials(Path(config.sensitivity))
     problems = [*folders.problems, *unread]

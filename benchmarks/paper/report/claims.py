@@ -84,7 +84,8 @@ def fewer_samples(results: Results) -> list[Finding]:
 def planning_improves(results: Results) -> list[Finding]:
     """Planner less actor at the usual number of samples, by task; beyond two standard errors."""
     findings = []
-    for task, group in usual_groups(results.runs).items():
+    groups = usual_groups(results.runs)
+    for task, group in ((task, groups[task]) for task in groups if task in TASKS):
         gain = planning_gain(group)
         figure = f"{_text(gain.mean, '+')} ± {_text(gain.standard_error)}"
         better = gain.mean > 2 * gain.standard_error

@@ -11,8 +11,8 @@ from phihp_torchrl.evaluation import PUBLISHED
 from report.bounds import normalise
 from report.efficiency import points_by_seed
 from report.learning_curve import draw_learning_curves, learning_curve
-from report.paper_systems import BASELINES, IMAGINED, PHIHP, TD3, PaperSystem
-from report.results import SIX_TASKS, TASKS, Results
+from report.paper_systems import PHIHP, TD3, PaperSystem, systems
+from report.results import SIX_TASKS, Results
 from report.sections import Picture, Section
 
 Curves = Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]]
@@ -20,11 +20,11 @@ Curves = Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]]
 
 def learning_curves(results: Results) -> Section:
     """Return over real samples, by task and over tasks."""
-    systems = (PHIHP, *BASELINES)
-    panels = {task: sample_curves(results, systems, task) for task in TASKS}
+    compared = systems("ours", "baseline")
+    panels = {task: sample_curves(results, compared, task) for task in results.tasks}
     over_tasks = {}
     missing = []
-    for system in systems:
+    for system in compared:
         by_task = {task: points_by_seed(results.scores(system, task)) for task in SIX_TASKS}
         if all(by_task.values()):
             over_tasks[system.name] = [mean_over_tasks(by_task)]
@@ -58,9 +58,9 @@ def learning_curves(results: Results) -> Section:
 
 def imagined_curves(results: Results) -> Section:
     """TD3's return in the real world over its updates, imagined and real."""
-    panels: dict[str, Curves] = {task: update_curves(results, task) for task in TASKS}
+    panels: dict[str, Curves] = {task: update_curves(results, task) for task in results.tasks}
     drawn = {name for curves in panels.values() for name in curves}
-    missing = [system.name for system in (*IMAGINED, TD3) if system.name not in drawn]
+    missing = [system.name for system in (*systems("imagined"), TD3) if system.name not in drawn]
     text = (
         "Return of the noise-free actor in the real world during training; TD3-im-ph imagines with "
         "the hybrid model, TD3-im-dd with the data-driven one, TD3 takes real steps, one an update."
@@ -74,10 +74,10 @@ def imagined_curves(results: Results) -> Section:
     )
 
 
-def sample_curves(results: Results, systems: Sequence[PaperSystem], task: str) -> Curves:
+def sample_curves(results: Results, compared: Sequence[PaperSystem], task: str) -> Curves:
     """Real samples and returns of each seed, for the systems that were run."""
     curves = {}
-    for system in systems:
+    for system in compared:
         points = points_by_seed(results.scores(system, task)).values()
         if points:
             curves[system.name] = [tuple(zip(*seed, strict=True)) for seed in points]
@@ -87,7 +87,7 @@ def sample_curves(results: Results, systems: Sequence[PaperSystem], task: str) -
 def update_curves(results: Results, task: str) -> Curves:
     """Updates and returns of each seed, at the usual number of real samples."""
     curves = {}
-    for system in (*IMAGINED, TD3):
+    for system in (*systems("imagined"), TD3):
         seeds = []
         for score in results.usual(system, task):
             points = [p for p in score.run.curve if p.acting == "actor" and p.updates == p.updates

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from measures import PREDICTION_STEPS
-from report.results import TASKS, Results
+from report.results import Results
 from report.runs import Run
 from report.sections import Picture, Section
 from report.tables import Stat, Table, TableCell
@@ -18,15 +18,18 @@ _ERROR = "coverage_median"
 
 def generalization(results: Results) -> Section:
     """A point for each run whose model was measured."""
-    groups = {(task, kind): measured(results, task, kind) for task in TASKS for kind in KINDS}
+    groups = {
+        (task, kind): measured(results, task, kind) for task in results.tasks for kind in KINDS
+    }
     rows: list[list[TableCell]] = []
     for (task, kind), runs in groups.items():
         errors = tuple(run.prediction[_ERROR] for run in runs)
         rows.append([f"{task}, {KINDS[kind]}", Stat(errors, 5), Stat(tuple(map(final, runs)))])
     columns = 4
-    figure = Figure(figsize=(13.6, 5.6), layout="constrained")
-    axes = figure.subplots(-(-len(TASKS) // columns), columns).ravel()
-    for axis, task in zip(axes, TASKS, strict=False):
+    lines = -(-len(results.tasks) // columns)
+    figure = Figure(figsize=(13.6, 2.8 * lines), layout="constrained")
+    axes = figure.subplots(lines, columns).ravel()
+    for axis, task in zip(axes, results.tasks, strict=False):
         axis.set(title=task, xlabel=f"error after {PREDICTION_STEPS} steps", ylabel="return")
         axis.set_xscale("log")
         axis.grid(alpha=0.3)
@@ -37,7 +40,7 @@ def generalization(results: Results) -> Section:
                 axis.legend(fontsize="small")
         if not (groups[task, "hybrid"] or groups[task, "data_driven"]):
             axis.text(0.5, 0.5, "not run", ha="center", transform=axis.transAxes)
-    for axis in axes[len(TASKS) :]:
+    for axis in axes[len(results.tasks) :]:
         axis.set_axis_off()
     return Section(
         "Generalization",

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from phihp_torchrl.evaluation import PUBLISHED, Published
 from report.efficiency import sample_efficiency
-from report.paper_systems import BASELINES, PHIHP, PaperSystem
-from report.results import TASKS, Results
+from report.paper_systems import PaperSystem, systems
+from report.results import Results
 from report.sections import Section
 from report.tables import Stat, Table, TableCell
-
-_COLUMNS = (PHIHP, *BASELINES)
 
 
 def main_table(results: Results) -> Section:
@@ -34,26 +32,30 @@ def main_table(results: Results) -> Section:
         "`cartpole-swingup-published`. Returns and times are those at the default preset's "
         "number of real samples, or at the most where there is no such run.",
         {
-            "Return": _table("main_return", returns, _published_return),
+            "Return": _table("main_return", results.tasks, returns, _published_return),
             "Real samples to 90 % of the best return": _table(
-                "main_samples", samples, _published_samples
+                "main_samples", results.tasks, samples, _published_samples
             ),
             "Milliseconds for an action, mean": _table(
-                "main_milliseconds", milliseconds, _published_milliseconds
+                "main_milliseconds", results.tasks, milliseconds, _published_milliseconds
             ),
         },
     )
 
 
 def _table(
-    name: str, ours: Callable[[PaperSystem, str], TableCell], theirs: Callable[[Published], str]
+    name: str,
+    tasks: Sequence[str],
+    ours: Callable[[PaperSystem, str], TableCell],
+    theirs: Callable[[Published], str],
 ) -> Table:
+    columns = systems("ours", "baseline")
     header, rows = ["task"], []
-    for system in _COLUMNS:
+    for system in columns:
         header += [system.name, f"{system.name}, published"]
-    for task in TASKS:
+    for task in tasks:
         row: list[TableCell] = [task]
-        for system in _COLUMNS:
+        for system in columns:
             published = PUBLISHED.get(task, {}).get(system.name)
             row += [ours(system, task), "–" if published is None else theirs(published)]
         rows.append(row)

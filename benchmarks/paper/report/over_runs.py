@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from report.aggregate import METRICS, Aggregate, aggregates, profiles, score_matrix
-from report.paper_systems import SYSTEMS
-from report.results import SIX_TASKS, TASKS, Results
+from report.bounds import BOUNDS
+from report.paper_systems import systems
+from report.results import SIX_TASKS, Results
 from report.sections import Picture, Section
 from report.tables import NOT_RUN, Interval, Number, Table, TableCell
 
@@ -22,10 +23,11 @@ _THRESHOLDS = np.linspace(0.0, 1.0, 101)
 
 def aggregate_section(results: Results, reps: int) -> Section:
     """Tables over the six tasks and by task, and two figures."""
-    groups = {OVER_TASKS: SIX_TASKS, **{task: (task,) for task in TASKS}}
+    bounded = [task for task in results.tasks if task in BOUNDS]
+    groups = {OVER_TASKS: SIX_TASKS, **{task: (task,) for task in bounded}}
     matrices: dict[str, dict[str, NDArray[np.float64]]] = {}
     for group, tasks in groups.items():
-        found = ((s.name, score_matrix(results, s, tasks)) for s in SYSTEMS)
+        found = ((s.name, score_matrix(results, s, tasks)) for s in systems())
         matrices[group] = {name: matrix for name, matrix in found if matrix is not None}
     estimates = {group: aggregates(scores, reps) for group, scores in matrices.items()}
     return Section(
@@ -35,7 +37,10 @@ def aggregate_section(results: Results, reps: int) -> Section:
         "The six tasks are all but `cartpole-swingup-published`.",
         {
             "Over the six tasks": _over_tasks(estimates[OVER_TASKS]),
-            **{f"By task: {metric}": _by_task(estimates, i) for i, metric in enumerate(METRICS)},
+            **{
+                f"By task: {metric}": _by_task(estimates, bounded, i)
+                for i, metric in enumerate(METRICS)
+            },
         },
         [
             Picture("aggregates", _aggregate_figure(estimates), "Aggregate metrics, 95 %."),
@@ -47,21 +52,23 @@ def aggregate_section(results: Results, reps: int) -> Section:
 def _over_tasks(found: Mapping[str, Aggregate]) -> Table:
     """A row for each system."""
     rows: list[list[TableCell]] = []
-    for system in SYSTEMS:
+    for system in systems():
         one = found.get(system.name)
         seeds = Number(None if one is None else one.seeds)
         rows.append([system.name, seeds, *(_interval(one, i) for i in range(len(METRICS)))])
     return Table("aggregates_over_tasks", ["system", "seeds", *METRICS], rows)
 
 
-def _by_task(estimates: Mapping[str, Mapping[str, Aggregate]], metric: int) -> Table:
+def _by_task(
+    estimates: Mapping[str, Mapping[str, Aggregate]], tasks: Sequence[str], metric: int
+) -> Table:
     """A row for each task, a column for each system."""
     rows: list[list[TableCell]] = [
-        [task, *(_interval(estimates[task].get(system.name), metric) for system in SYSTEMS)]
-        for task in TASKS
+        [task, *(_interval(estimates[task].get(system.name), metric) for system in systems())]
+        for task in tasks
     ]
     name = METRICS[metric].replace(" ", "_").lower()
-    return Table(f"aggregates_{name}", ["task", *(system.name for system in SYSTEMS)], rows)
+    return Table(f"aggregates_{name}", ["task", *(system.name for system in systems())], rows)
 
 
 def _interval(one: Aggregate | None, i: int) -> TableCell:
@@ -109,4 +116,4 @@ def _profile_figure(matrices: Mapping[str, Mapping[str, NDArray[np.float64]]], r
 
 
 def _color(name: str) -> str:
-    return f"C{[system.name for system in SYSTEMS].index(name) % 10}"
+    return f"C{[system.name for system in systems()].index(name) % 10}"

@@ -1,13 +1,34 @@
-"""The systems that the paper compares, and which runs each is in."""
+"""The systems that tables compare: a row or a column for each registered method."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from phihp_torchrl.config import METHODS, get_method
+
+GROUPS = ("ours", "baseline", "ablation", "imagined")
+"""The groups of methods in the order in which tables have them."""
+
+_PAPER_ORDER = (
+    "phihp",
+    "td-mpc",
+    "td3",
+    "cem-oracle",
+    "td-mpc-star",
+    "ph-td-mpc-star",
+    "dd-cem",
+    "ph-cem",
+    "td3-im-ph",
+    "td3-im-dd",
+)
+# Methods that the paper does not have come after those of their group.
+
+_WAY = {"hybrid_planner": "planner", "plain_planner": "planner", "actor": "actor"}
+
 
 @dataclass(frozen=True)
 class PaperSystem:
-    """A row or a column of the paper.
+    """A row or a column of a table.
 
     Args:
         name: the paper's name.
@@ -19,25 +40,33 @@ class PaperSystem:
     sources: tuple[tuple[str, str | None], ...]
 
 
-PHIHP = PaperSystem("PhIHP", (("phihp", "planner"),))
-TD3_IM_PH = PaperSystem("TD3-im-ph", (("td3-im-ph", "actor"), ("phihp", "actor")))
-TD3_IM_DD = PaperSystem("TD3-im-dd", (("td3-im-dd", "actor"),))
-TD_MPC = PaperSystem("TD-MPC", (("td-mpc", None),))
-TD3 = PaperSystem("TD3", (("td3", None),))
-CEM_ORACLE = PaperSystem("CEM-oracle", (("cem-oracle", None),))
-PH_CEM = PaperSystem("Ph-CEM", (("ph-cem", None),))
-DD_CEM = PaperSystem("dd-CEM", (("dd-cem", None),))
-PH_TD_MPC_STAR = PaperSystem("Ph-TD-MPC*", (("ph-td-mpc-star", "planner"),))
-TD_MPC_STAR = PaperSystem("TD-MPC*", (("td-mpc-star", "planner"),))
+def system(method: str) -> PaperSystem:
+    """What tables have of a registered method.
 
-BASELINES = (TD_MPC, TD3, CEM_ORACLE)
-"""What the paper compares PhIHP with."""
+    Examples:
+        >>> system("td3-im-ph").sources
+        (('td3-im-ph', 'actor'), ('phihp', 'actor'))
+    """
+    known = get_method(method)
+    also = () if known.also_in is None else (known.also_in,)
+    return PaperSystem(known.label, ((method, _WAY.get(known.acting)), *also))
 
-ABLATIONS = (TD_MPC_STAR, PH_TD_MPC_STAR, DD_CEM, PH_CEM)
-"""PhIHP without a part of it."""
 
-IMAGINED = (TD3_IM_PH, TD3_IM_DD)
-"""The policy alone, learned in either model."""
+def systems(*groups: str) -> tuple[PaperSystem, ...]:
+    """The systems of these groups, or of all: those of the paper and those of plugins.
 
-SYSTEMS = (PHIHP, *BASELINES, *ABLATIONS, *IMAGINED)
-"""All systems of the paper."""
+    Examples:
+        >>> [one.name for one in systems("baseline")][:3]
+        ['TD-MPC', 'TD3', 'CEM-oracle']
+    """
+    order = {name: i for i, name in enumerate(_PAPER_ORDER)}
+    names = sorted(METHODS, key=lambda name: order.get(name, len(order)))
+    return tuple(
+        system(name) for group in groups or GROUPS for name in names if METHODS[name].group == group
+    )
+
+
+PHIHP, TD_MPC, TD3 = system("phihp"), system("td-mpc"), system("td3")
+TD3_IM_PH, TD3_IM_DD = system("td3-im-ph"), system("td3-im-dd")
+PH_CEM, DD_CEM = system("ph-cem"), system("dd-cem")
+PH_TD_MPC_STAR, TD_MPC_STAR = system("ph-td-mpc-star"), system("td-mpc-star")

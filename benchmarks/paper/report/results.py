@@ -72,6 +72,16 @@ class Results:
     def __init__(self, runs: Iterable[Run]) -> None:
         self.runs = tuple(runs)
 
+    @property
+    def others(self) -> tuple[str, ...]:
+        """Tasks that were run and that the paper does not have: they have no published numbers."""
+        return tuple(sorted({run.task for run in self.runs} - {*TASKS}))
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The paper's tasks, run or not, and the others."""
+        return (*TASKS, *self.others)
+
     def scores(self, system: PaperSystem, task: str) -> list[Score]:
         """All scores of a system on a task, one for each seed and number of samples."""
         found: dict[tuple[int, int], Score] = {}

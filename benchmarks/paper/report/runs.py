@@ -44,7 +44,7 @@ class Run:
     Args:
         folder: where it was read from.
         method: name of its method.
-        task: name of its task.
+        task: name of its task, with the world's where it is not the simulated one.
         label: name of its settings.
         samples: real samples it was given.
         seed: its seed.
@@ -124,11 +124,13 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
     if not any_version:
         _check_version(session["versions"]["phihp_torchrl"])
     method, task = config.get("method", DEFAULT_METHOD), config["task"]
+    world = (config.get("world") or {}).get("kind", "simulated")
     kind = (config.get("model") or {}).get("kind")
     return Run(
         folder=folder,
         method=method,
-        task=task,
+        # Published returns and bounds are of the simulated worlds.
+        task=task if world == "simulated" else f"{task} in {world}",
         label=cell.get("label") or _label(folder.name, task, method),
         samples=int(cell.get("samples") or metadata["real_steps"]),
         seed=int(config["seed"]),

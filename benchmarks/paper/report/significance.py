@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from phihp_torchrl.evaluation import PUBLISHED
-from report.paper_systems import BASELINES, PHIHP
-from report.results import TASKS, Results
+from report.paper_systems import PHIHP, systems
+from report.results import Results
 from report.sections import Section
 from report.tables import Number, Table, TableCell
 
@@ -72,9 +72,9 @@ def welch_published(task: str, baseline: str) -> Welch | None:
 def significance(results: Results) -> Section:
     """A row for each task and baseline."""
     rows: list[list[TableCell]] = []
-    for task in TASKS:
+    for task in results.tasks:
         ours = [score.mean for score in results.usual(PHIHP, task)]
-        for baseline in BASELINES:
+        for baseline in systems("baseline"):
             theirs = [score.mean for score in results.usual(baseline, task)]
             test, published = welch(ours, theirs), welch_published(task, baseline.name)
             short = "not run" if not (ours and theirs) else "too few seeds"

@@ -26,9 +26,13 @@ def time_to_return(runs: Sequence[Run], benchmarks: Path) -> Section:
     milliseconds = _update_milliseconds(benchmarks)
     rows: list[list[TableCell]] = []
     for (task, samples), group in both_ways(runs).items():
-        level = PUBLISHED[task]["PhIHP"].return_mean if task in PUBLISHED else TARGETS[task]
-        reached = [seconds for run in group if (seconds := seconds_to(run, level)) is not None]
         whole = [run.seconds["model"] + run.seconds["policy"] for run in group]
+        level = _level(task)
+        if level is None:
+            unknown: list[TableCell] = ["–"] * 3
+            rows.append([task, str(samples), *unknown, Stat(tuple(whole), 0), "–", "–"])
+            continue
+        reached = [seconds for run in group if (seconds := seconds_to(run, level)) is not None]
         budget = None if milliseconds is None else milliseconds * PUBLISHED_UPDATES[task] / 1e3
         ratio = budget * len(reached) / sum(reached) if budget and any(reached) else None
         rows.append(
@@ -64,6 +68,11 @@ def seconds_to(run: Run, level: float) -> float | None:
     if any(acting.mean >= level for acting in run.acting.values()):
         return run.seconds["model"] + run.seconds["policy"]
     return None
+
+
+def _level(task: str) -> float | None:
+    """The published return, or else our target; ``None`` for a task that has neither."""
+    return PUBLISHED[task]["PhIHP"].return_mean if task in PUBLISHED else TARGETS.get(task)
 
 
 def _update_milliseconds(benchmarks: Path) -> float | None:
