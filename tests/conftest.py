@@ -21,7 +21,12 @@ settings.load_profile("phihp")
 
 @pytest.fixture(autouse=True)
 def seed() -> int:
-    """Seed Python, NumPy and torch before every test; request it to know the number."""
+    """Seed Python, NumPy and torch before every test; request it to know the number.
+
+    Runs flush denormals for the rest of the process, which would make numbers differ with the order
+    of the tests.
+    """
+    torch.set_flush_denormal(False)
     random.seed(SEED)
     np.random.seed(SEED)
     torch.manual_seed(SEED)

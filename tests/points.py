@@ -6,7 +6,8 @@ from math import inf
 
 import torch
 
-from phihp_torchrl.planners import ActionBounds, Problem
+from phihp_torchrl.planners import Problem
+from phihp_torchrl.tasks import ActionBounds
 
 ZEROS = torch.zeros(2, dtype=torch.float64)
 

@@ -1,4 +1,4 @@
-"""Cells of a grid for tests: the methods, the least they can do, and what they left."""
+"""Cells of a grid for tests: the least they can do, and what they left."""
 
 from __future__ import annotations
 
@@ -8,22 +8,18 @@ from pathlib import Path
 import yaml
 
 from cluster_check import TINY as LEAST
-from grid import CellState, GridConfig, MethodConfig, work
-from phihp_torchrl.trainers import from_mapping
-from recipe_configs import RECIPES
+from grid import CellState, GridConfig, work
 
-PAPER = RECIPES.parent / "benchmarks" / "paper"
+ROOT = Path(__file__).parents[3]
+PAPER = ROOT / "benchmarks" / "paper"
 YAML = yaml.safe_load((PAPER / "config" / "grid.yaml").read_text())
-METHODS = {
-    name: from_mapping(MethodConfig, how, f"methods.{name}")
-    for name, how in YAML["methods"].items()
-}
 # The number of samples is the cell's.
 TINY = (
     *LEAST,
     "progress=false",
     "model.steps_per_iteration=30",
     "policy.updates=8",
+    "policy.refit.interval=0",
     "evaluate.video=false",
 )
 

@@ -25,6 +25,7 @@ def make_run(
     kind: str | None = "hybrid",
     error: float | None = None,
     ms: float = 5.0,
+    world: str | None = None,
 ) -> Path:
     """A finished run's folder, as the benchmark keeps it."""
     acting = acting or {"planner": [-180.0, -190.0], "actor": [-181.0, -192.0]}
@@ -32,6 +33,7 @@ def make_run(
     folder = runs / name
     folder.mkdir(parents=True)
     model = f"model: {{real_steps: {samples}, kind: {kind}}}\n" if kind else "model: null\n"
+    model += f"world: {{kind: {world}}}\n" if world else ""  # older runs do not say it
     (folder / "config.yaml").write_text(f"task: {task}\nmethod: {method}\nseed: {seed}\n{model}")
     session = {
         "commit": "0123456789abcdef",

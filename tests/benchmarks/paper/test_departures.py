@@ -8,7 +8,8 @@ import sys
 import pytest
 
 import departures
-from recipe_configs import compose_request
+from phihp_torchrl.config import compose_yaml, flatten
+from phihp_torchrl.trainers import read_request
 
 
 @pytest.fixture
@@ -30,13 +31,12 @@ def test_departures_are_those_of_the_task(script):
 
 
 @pytest.mark.parametrize("task", ["pendulum-swingup", "acrobot", "cartpole-swingup"])
-def test_every_published_value_is_one_that_the_recipes_take(script, task):
-    paper = script.settings("paper")
+def test_every_published_value_is_one_that_a_run_takes(script, task):
+    composed = compose_yaml([f"task={task}"])
     for key, value in script.departures(task).items():
-        changes = [f"task={task}", f"{key}={script.override(value)}"]
-        changes += [f"{k}={script.override(paper[k][task])}"
-                    for k in script.TOGETHER.get(key, ())]  # fmt: skip
-        compose_request("phihp", changes)
+        words = script.changes(task, key)
+        config = read_request(composed, [f"task={task}", *words]).config
+        assert flatten(config.to_mapping())[key] == value
 
 
 def test_effects_in_words(script):

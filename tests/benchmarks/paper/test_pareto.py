@@ -8,16 +8,17 @@ from dataclasses import replace
 
 import pytest
 import torch
+from grid_cells import ROOT
 
 import pareto
-from phihp_torchrl import HybridDynamics, get_task
+from phihp_torchrl import HybridDynamics, get_task, load_config
 from phihp_torchrl.agents import Actor, TwinQ
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.evaluation import EVALUATION_SEED
-from phihp_torchrl.planners.factory import PlannerConfig
-from recipe_configs import RECIPES, compose_request
+from phihp_torchrl.planners import CEMConfig
+from phihp_torchrl.trainers import read_run_config
 
-TINY = PlannerConfig(
+TINY = CEMConfig(
     planning_horizon=2, optim_steps=1, num_candidates=4, top_k=2, num_policy_candidates=2, alpha=0.7
 )
 
@@ -109,8 +110,7 @@ def test_tasks_swept_before_stay(script, monkeypatch):
 
 @pytest.mark.parametrize("task", ["acrobot", "pendulum-swingup"])
 def test_the_fast_budget_is_what_the_sweep_chose(task):
-    swept = json.loads((RECIPES.parent / pareto.RESULTS / "pareto.json").read_text())
+    swept = json.loads((ROOT / pareto.RESULTS / "pareto.json").read_text())
     chosen = pareto.choose(swept["tasks"])
-    lines = [f"task={task}", "budget=fast"]
-    fast = compose_request("phihp", lines).config.planner
+    fast = read_run_config(load_config(task, overrides=["budget=fast"])).planner
     assert fast == pareto.planner_config(task, chosen)

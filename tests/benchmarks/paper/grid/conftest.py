@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from grid_cells import METHODS, TINY
+from grid_cells import TINY
 
 from grid import GridConfig
 
@@ -22,5 +22,4 @@ def config(tmp_path: Path) -> GridConfig:
         runs=str(tmp_path / "runs"),
         results=str(tmp_path / "kept"),
         claim_wait=0.0,
-        methods=METHODS,
     )

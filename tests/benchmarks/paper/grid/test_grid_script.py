@@ -9,10 +9,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from grid_cells import METHODS, PAPER, TINY, YAML
+from grid_cells import PAPER, TINY, YAML
 from hydra import compose, initialize_config_dir
 
-from recipe_configs import compose_request
+from grid import GridConfig
+from phihp_torchrl.config import METHODS, compose_yaml, from_mapping
+from phihp_torchrl.trainers import read_request
 
 
 @pytest.mark.slow
@@ -46,7 +48,7 @@ def test_the_script_runs_a_grid_shows_it_and_skips_it(
         (["share=0"], "share: expected a positive number or null"),
         (["task=my-task"], "share: expected null for 'my-task'"),
         (["label=a/b"], "label: expected letters"),
-        (["jobs=0"], "jobs: expected a positive number"),
+        (["jobs=0"], "jobs: expected a whole number >= 1"),
         (["+sead=0"], "sead: unknown key; did you mean 'seed'"),
     ],
 )
@@ -61,13 +63,17 @@ def test_a_wrong_grid_is_one_sentence_and_no_run(
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("task", ["pendulum", "acrobot-swingup"])
 def test_every_method_composes(method: str, task: str) -> None:
-    how = METHODS[method]
-    lines = [f"task={task}", "seed=1", "progress=false", *how.overrides, *YAML["overrides"]]
-    if how.samples_key is not None:
-        lines.append(f"{how.samples_key}=500")
-    made = compose_request(how.recipe, lines).config
-    assert getattr(made, "method", "phihp") == method
-    assert made.seed == 1
+    keys = {key: value for key, value in YAML.items() if key not in ("defaults", "hydra")}
+    config = from_mapping(GridConfig, {**keys, "method": method, "task": task, "seed": 1})
+    words = config.words()
+    made = read_request(compose_yaml(words), words).config
+    assert (made.method, made.task, made.seed) == (method, task, 1)
+    samples = config.cell().samples
+    assert (samples is None) == (METHODS[method].samples_key is None)
+    if samples is not None:
+        assert made.section("model").real_steps == samples
+    if method == "td3":  # the grid's own choice
+        assert made.section("td3").real_steps == 300_000
 
 
 @pytest.mark.parametrize("launcher", ["basic", "joblib", "ray", "submitit"])

@@ -11,7 +11,7 @@ from grid_cells import YAML
 
 from grid import Cell, GridConfig, LiveTable, Status, look, swept_cells
 from grid.display import summary, table
-from phihp_torchrl.trainers import ConfigError
+from phihp_torchrl.config import ConfigError
 
 
 def test_the_grid_is_the_product_in_the_launchers_order(tmp_path: Path) -> None:
@@ -63,5 +63,5 @@ def test_half_written_files_say_what_they_are(config: GridConfig) -> None:
 
 def test_names_are_files() -> None:
     assert Cell("ph-cem", "acrobot", 3, 5000, "paper").name == "acrobot-ph-cem-paper-n5000-seed3"
-    with pytest.raises(ValueError, match="label: expected letters"):
+    with pytest.raises(ConfigError, match="label: expected letters"):
         Cell("phihp", "acrobot", 0, label="..")

@@ -129,7 +129,7 @@ def test_a_failed_cell_is_reported_and_run_again_on_request_alone(config: GridCo
     wrong = replace(config, overrides=(*TINY, "policy.batch_size=0"))
     state = do(wrong)
     assert state.status is Status.FAILED
-    assert "batch_size: expected a positive number" in state.detail
+    assert "policy.batch_size: expected a whole number >= 1" in state.detail
     assert do(config) == state  # whatever its settings
     assert words(config) == []  # not even started
     files = config.files(Path())

@@ -18,9 +18,10 @@ from measures import (
     unseen_episodes,
     write_curve,
 )
-from phihp_torchrl import HybridDynamics, get_task
+from phihp_torchrl import ConfigError, HybridDynamics
 from phihp_torchrl.evaluation import PUBLISHED, TARGETS
 from phihp_torchrl.tasks import list_tasks
+from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 
 def test_paired_difference():
@@ -79,14 +80,16 @@ def test_a_curve_is_every_evaluation_in_the_real_world(tmp_path):
 
 
 def test_predictions_are_judged_on_states_of_their_own():
-    task = get_task("acrobot")
-    start, actions, end = unseen_episodes(task, "coverage")
+    world = SimulatedWorld("acrobot")
+    start, actions, end = unseen_episodes(world, "coverage")
     assert start.shape == end.shape == (PREDICTION_EPISODES, 4)
     assert actions.shape == (PREDICTION_EPISODES, PREDICTION_STEPS, 1)
-    assert torch.equal(start, unseen_episodes(task, "coverage").start)
-    right = prediction_errors(task, HybridDynamics.oracle(task))
-    wrong = prediction_errors(task, HybridDynamics.hybrid(task))
+    assert torch.equal(start, unseen_episodes(world, "coverage").start)
+    right = prediction_errors(world, world.oracle())
+    wrong = prediction_errors(world, HybridDynamics.hybrid(world.task))
     assert right["reset_mean"] < 1e-4 < wrong["reset_mean"]
     assert right["coverage_median"] < 1e-2 < wrong["coverage_median"]
-    with pytest.raises(ValueError, match="where: expected a box"):
-        unseen_episodes(task, "nowhere")
+    other = SimulatedWorld("acrobot", SimulatedConfig(integrator="rk4", substeps=2))
+    assert prediction_errors(other, world.oracle())["reset_mean"] > 1e-3, "the truth is the world's"
+    with pytest.raises(ConfigError, match="where: expected a box"):
+        unseen_episodes(world, "nowhere")

@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 from kept_runs import make, make_run, results, table
 
 from measures import DEFAULT_SAMPLES
-from phihp_torchrl import get_task
-from recipe_configs import CONFIG
+from phihp_torchrl import get_task, load_config
 from report import (
     BOUNDS,
     NOT_RUN,
@@ -27,12 +25,7 @@ from report.aggregate import aggregates, profiles, score_matrix
 from report.curves import mean_over_tasks, sample_curves, update_curves
 from report.efficiency import learning_points, sample_efficiency
 from report.learning_curve import learning_curve
-from report.paper_systems import (
-    CEM_ORACLE,
-    PHIHP,
-    TD3,
-    TD3_IM_PH,
-)
+from report.paper_systems import PHIHP, TD3, TD3_IM_PH, system
 from report.significance import welch_published
 from report.time_to_return import seconds_to
 
@@ -100,7 +93,7 @@ def test_an_own_run_goes_before_the_part_of_another(tmp_path: Path) -> None:
 
 def test_a_cem_without_samples(tmp_path: Path) -> None:
     make_run(tmp_path, "cem-oracle", samples=0, kind="oracle", acting={"planner": [-200.0]})
-    assert sample_efficiency(results(tmp_path), CEM_ORACLE, "pendulum") == (0.0,)
+    assert sample_efficiency(results(tmp_path), system("cem-oracle"), "pendulum") == (0.0,)
 
 
 def test_the_mean_over_tasks_starts_where_all_have_a_return() -> None:
@@ -175,9 +168,7 @@ def test_the_default_presets_samples_go_before_more(tmp_path: Path) -> None:
 
 def test_the_default_preset_takes_the_samples_that_reports_think() -> None:
     for task, samples in DEFAULT_SAMPLES.items():
-        path = CONFIG / "task" / f"{task}.yaml"
-        preset = yaml.safe_load(path.read_text())["presets"]["default"]
-        assert preset["model"]["real_steps"] == samples, task
+        assert load_config(task)["model"]["real_steps"] == samples, task
 
 
 def test_seconds_to_a_return(tmp_path: Path) -> None:

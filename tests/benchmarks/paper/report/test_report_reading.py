@@ -7,16 +7,16 @@ import math
 from pathlib import Path
 
 import pytest
+from grid_cells import ROOT
 from kept_runs import VERSION, make, make_run, table, text
 
-from recipe_configs import RECIPES
 from report import (
     NOT_RUN,
     read_run,
     read_runs,
 )
 
-COMMITTED = RECIPES.parent / "results" / "runs"
+COMMITTED = ROOT / "results" / "runs"
 
 
 def test_the_committed_runs_are_read_as_they_are() -> None:

@@ -8,9 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from grid_cells import ROOT
 from kept_runs import make_run
-
-from recipe_configs import RECIPES
 
 
 def test_the_script_makes_the_report_and_logs_its_figures(
@@ -29,7 +28,7 @@ def test_the_script_makes_the_report_and_logs_its_figures(
     assert "### Returns with fewer real samples" in overview_page
     assert "2 evaluation episodes each" in overview_page
     assert list((tmp_path / "outputs" / "report").rglob("*tfevents*"))
-    with pytest.raises(SystemExit, match=r"^error: reps: expected a positive"):
+    with pytest.raises(SystemExit, match=r"^error: reps: expected a whole number"):
         run_script("make_report", "reps=0")
 
 
@@ -37,7 +36,7 @@ def test_the_script_makes_the_report_and_logs_its_figures(
 def test_sensitivity_is_swept_and_reported(
     run_script: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    agent = RECIPES.parent / "results" / "agents" / "pendulum"
+    agent = ROOT / "results" / "agents" / "pendulum"
     run_script(
         "sensitivity", f"agent={agent}", "episodes=1", "latency_actions=2",
         "planning_horizon=[1,2]", "replan_every=[1,99]", "num_policy_candidates=[0]",
@@ -56,5 +55,5 @@ def test_sensitivity_is_swept_and_reported(
     assert all(trial["milliseconds"] > 0 for trial in trials)
     with pytest.raises(SystemExit, match=r"^error: agent: expected the directory"):
         run_script("sensitivity")
-    with pytest.raises(SystemExit, match=r"^error: episodes: expected a positive"):
+    with pytest.raises(SystemExit, match=r"^error: episodes: expected a whole number"):
         run_script("sensitivity", f"agent={agent}", "episodes=0")

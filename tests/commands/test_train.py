@@ -1,0 +1,61 @@
+"""``phihp train`` on the command line: mappings, sweeps, and runs that were stopped."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from phihp_torchrl.commands import job
+from phihp_torchrl.config import parse_overrides
+from phihp_torchrl.trainers import RunResult
+
+from .command_parts import FAST
+from .conftest import Command
+
+MODEL = ("task=pendulum", "phases=[model]", *FAST)
+
+
+def test_a_mapping_may_be_given_in_one_word(phihp: Command, place: Path) -> None:
+    phihp("train", *MODEL, "run_dir=run", "world.friction={joint:0.25}")
+    kept = yaml.safe_load((place / "run" / "config.yaml").read_text())
+    assert kept["world"]["friction"] == {"joint": 0.25}
+    with pytest.raises(SystemExit, match=r"^error: .*friction"):
+        phihp("train", *MODEL, "run_dir=other", "world.friction={hinge:0.25}")
+
+
+def test_a_sweep_is_a_run_for_each_value(phihp: Command, place: Path) -> None:
+    phihp("train", "--multirun", *MODEL, "seed=0,1")
+    runs = sorted((place / "outputs" / "pendulum").iterdir())
+    seeds = [yaml.safe_load((run / "config.yaml").read_text())["seed"] for run in runs]
+    assert sorted(seeds) == [0, 1]
+    assert all((run / "metrics.csv").is_file() for run in runs)
+
+
+def test_a_stopped_run_says_how_to_go_on(
+    phihp: Command, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: Any, **__: Any) -> RunResult:
+        return RunResult(Path("my runs/one"), False, signal.SIGTERM, {})
+
+    monkeypatch.setattr(job, "run", stopped)
+    with pytest.raises(SystemExit) as error:
+        phihp("train", *MODEL)
+    assert error.value.code == 128 + signal.SIGTERM
+    told = capsys.readouterr().out.split("Go on with: ")[1]
+    *command, word = shlex.split(told)  # as a shell reads it
+    (line,) = parse_overrides([word])
+    assert (command, line.key_or_group) == (["phihp", "train"], "resume")
+    assert str(line.value()) == "my runs/one"
+
+
+@pytest.mark.parametrize("words", [["mode=paper"], ["-x", "policy.updates=0"]])
+def test_what_is_wrong_is_no_run(phihp: Command, place: Path, words: list[str]) -> None:
+    with pytest.raises(SystemExit) as error:
+        phihp("train", *MODEL, *words)
+    assert error.value.code
+    assert not (place / "outputs").exists()

@@ -1,0 +1,127 @@
+"""What agents do, and what they need for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from lopsided import LOPSIDED
+from tensordict import TensorDict
+
+from phihp_torchrl import Agent, CEMPlanner, MPPIPlanner, get_task
+from phihp_torchrl.agents import Actor, make_actor
+from phihp_torchrl.planners import MPPIConfig
+from phihp_torchrl.worlds import SimulatedWorld
+
+from .agent_parts import SMALL, act, make_agent, observations
+
+
+@pytest.mark.parametrize("batch", [[], [5], [2, 3]])
+@pytest.mark.parametrize("task", ["pendulum", "acrobot-swingup", LOPSIDED])
+def test_actions_in_bounds_for_any_batch(task, batch):
+    agent = make_agent(task)
+    bounds = agent.task.bounds
+    td = observations(agent, batch)
+    for policy in (agent, agent.actor_alone()):
+        action = policy(td.clone())["action"]
+        assert action.shape == (*batch, agent.task.action_dim)
+        assert (action >= bounds.low).all()
+        assert (action <= bounds.high).all()
+        assert not action.requires_grad
+
+
+def test_the_actor_alone_is_the_actor():
+    agent = make_agent()
+    td = observations(agent, [4])
+    alone = agent.actor_alone()
+    assert alone.planner is None
+    assert alone.planner_config == SMALL
+    assert torch.equal(act(alone, td), agent.actor.module(td["observation"]))
+    assert not torch.equal(act(agent, td), act(alone, td))
+    with torch.no_grad():
+        agent.actor.module.mlp[-1].bias.add_(1.0)
+    assert torch.equal(act(alone, td), agent.actor.module(td["observation"])), "parts are shared"
+
+
+def test_an_agent_plans_by_other_numbers_on_the_same_modules():
+    agent = make_agent(metadata={"seed": 3})
+    td = observations(agent, [4])
+    short = agent.with_planner(replace(SMALL, planning_horizon=1))
+    assert short.planner.settings.planning_horizon == 1
+    assert short.planner_config == replace(SMALL, planning_horizon=1)
+    assert not torch.equal(act(short, td), act(agent, td))
+    assert torch.equal(act(short.with_planner(SMALL), td), act(agent, td))
+    by_mppi = agent.with_planner(MPPIConfig(num_candidates=16, top_k=4, num_policy_candidates=4))
+    assert type(by_mppi.planner) is MPPIPlanner
+    assert type(agent.planner) is CEMPlanner
+    for other in (short, by_mppi):
+        assert other.metadata == {"seed": 3}
+        for name, module in agent.modules_by_name().items():
+            assert other.modules_by_name()[name] is module
+
+
+def test_an_agent_says_what_it_is_made_of():
+    agent = make_agent()
+    assert agent.kind == "phihp"
+    assert list(agent.modules_by_name()) == ["dynamics", "actor", "qvalue"]
+    config = agent.config
+    assert config["actor"] == {"kind": "mlp_actor", "hidden_sizes": [8, 8]}
+    assert config["qvalue"] == {"kind": "twin_q", "hidden_sizes": [8, 8]}
+    assert config["dynamics"]["integrator"] == {"name": "semi_implicit_euler", "substeps": 1}
+    assert config["planner"]["kind"] == "cem"
+    assert config["planner"]["num_candidates"] == 16
+    alone = Agent(agent.task, actor=make_actor(agent.task, (4,)))
+    assert alone.config == {"actor": {"kind": "mlp_actor", "hidden_sizes": [4]}, "planner": None}
+
+
+def test_an_agent_is_made_of_what_it_says():
+    agent = make_agent()
+    parts = Agent.build_modules(agent.task, agent.config)
+    for name, module in agent.modules_by_name().items():
+        parts[name].load_state_dict(module.state_dict())
+    again = Agent.from_config(agent.task, agent.config, parts)
+    td = observations(agent, [4])
+    assert torch.equal(act(again, td), act(agent, td))
+    assert again.config == agent.config
+
+
+def test_an_agent_forgets_its_plan_on_reset():
+    agent = make_agent(config=replace(SMALL, replan_every=3))
+    td = observations(agent, [2])
+    agent(td.clone())
+    assert agent.planner.receding._plans is not None
+    agent.reset()
+    assert agent.planner.receding._plans is None
+    agent.actor_alone().reset()
+
+
+def test_an_agent_needs_enough_parts():
+    task = get_task("pendulum")
+    with pytest.raises(ValueError, match="actor: expected"):
+        Agent(task)
+    with pytest.raises(ValueError, match="dynamics: expected a model"):
+        Agent(task, actor=Actor(task, (4,)), planner_config=SMALL)
+    with pytest.raises(ValueError, match="actor: expected a module"):
+        Agent(task, dynamics=SimulatedWorld(task).oracle(), planner_config=SMALL)
+    plain = Agent(
+        task,
+        dynamics=SimulatedWorld(task).oracle(),
+        planner_config=replace(SMALL, num_policy_candidates=0),
+    )
+    assert plain(observations(plain, [2]))["action"].shape == (2, 1)
+
+
+@pytest.mark.parametrize("planner", [True, False])
+def test_bad_observations_are_named(planner):
+    agent = make_agent() if planner else make_agent().actor_alone()
+    for bad in (
+        torch.zeros(3, 2),
+        torch.zeros(3, 3, dtype=torch.float64),
+        torch.zeros(3, 3, device="meta"),
+        torch.full((3, 3), torch.nan),
+    ):
+        with pytest.raises(ValueError, match=r"^observation: expected"):
+            agent(TensorDict({"observation": bad}, batch_size=[3]))
+    with pytest.raises(ValueError, match="observation: expected"):
+        agent(TensorDict(batch_size=[3]))

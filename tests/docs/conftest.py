@@ -1,0 +1,76 @@
+"""A place to run printed examples in, with small settings, and everything as it was afterwards."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import phihp_torchrl
+from phihp_torchrl.commands import learn
+from phihp_torchrl.config import METHODS, override_lines
+from phihp_torchrl.config.choices import _OFFERED
+from phihp_torchrl.deployment import AGENT_KINDS
+from phihp_torchrl.planners import PLANNERS
+from phihp_torchrl.tasks.registry import _TASKS
+from phihp_torchrl.trainers import PHASES
+from phihp_torchrl.worlds import WORLDS
+from phihp_torchrl.worlds.simulated.plant import _PLANTS
+from tests.docs.blocks import ROOT, write_titled
+
+TINY = {
+    "model.real_steps": 50,
+    "model.fit.steps": 2,
+    "policy.updates": 2,
+    "policy.evaluation_interval": 2,
+    "policy.evaluation_episodes": 2,
+    "policy.refit.interval": 0,
+    "policy.random_steps": 64,
+    "planner.num_candidates": 8,
+    "planner.num_policy_candidates": 2,
+    "planner.top_k": 2,
+    "planner.planning_horizon": 2,
+    "planner.num_kept_elites": 0,
+    "evaluate.episodes": 1,
+    "evaluate.latency_actions": 0,
+    "evaluate.video": False,
+    "compile": False,
+    "progress": False,
+}
+"""What makes a printed run short; it goes over what the example says."""
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A working directory with every file that a page prints and with the trained agents."""
+    write_titled(tmp_path)
+    (tmp_path / "results").symlink_to(ROOT / "results")
+    monkeypatch.chdir(tmp_path)
+    for directory in {tmp_path, *(path.parent for path in tmp_path.glob("*/*.py"))}:
+        monkeypatch.syspath_prepend(directory)
+    tables = [_OFFERED, _PLANTS]
+    tables += [r._entries for r in (METHODS, AGENT_KINDS, PLANNERS, _TASKS, PHASES, WORLDS)]
+    before = [dict(table) for table in tables]
+    yield tmp_path
+    for table, entries in zip(tables, before, strict=True):
+        table.clear()
+        table.update(entries)
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs are short, and windows do not wait for the clock on the wall."""
+
+    def learn_little(*arguments, overrides=(), **options):
+        lines = [*override_lines(overrides), *override_lines(TINY)]
+        return learn(*arguments, overrides=lines, **options)
+
+    monkeypatch.setattr(phihp_torchrl, "learn", learn_little, raising=False)
+    pygame = pytest.importorskip("pygame")
+    monkeypatch.setattr(pygame.time, "Clock", lambda: SimpleNamespace(tick=lambda rate: None))

@@ -1,0 +1,117 @@
+"""One episode in full, in whatever world, and its pictures."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from phihp_torchrl import get_task
+from phihp_torchrl.evaluation import evaluation_seed, play_episode
+from phihp_torchrl.worlds import (
+    EnvWorld,
+    GymnasiumConfig,
+    GymnasiumWorld,
+    SimulatedConfig,
+    SimulatedWorld,
+)
+
+from .policies import balance, constant
+
+PENDULUM = get_task("pendulum")
+
+
+def test_an_episode_is_what_was_evaluated():
+    task = get_task("cartpole")
+    episode = play_episode(balance(), task, max_steps=50)
+    assert episode.states.shape == (51, 4)
+    assert episode.actions.shape == (50, 1)
+    assert episode.total_reward == 50.0
+    assert not episode.terminated
+    assert episode.frames.size == 0
+    states = torch.from_numpy(episode.states)
+    expected = SimulatedWorld(task).step(states[:-1], torch.from_numpy(episode.actions))
+    torch.testing.assert_close(states[1:], expected, rtol=0, atol=1e-5)  # seen in float32
+    fallen = play_episode(constant(), task)
+    assert fallen.terminated
+    assert len(fallen.rewards) < 200
+    again = play_episode(balance(), task, max_steps=50)
+    assert np.array_equal(again.states, episode.states)
+    other = play_episode(balance(), task, max_steps=50, seed=evaluation_seed(1))
+    assert not np.array_equal(other.states, episode.states)
+
+
+def test_states_are_as_they_are_observed():
+    """A pendulum that goes round: the angle stays on the circle, the velocity is its own."""
+    episode = play_episode(constant(2.0), "pendulum-swingup", max_steps=200)
+    theta = episode.states[:, 0]
+    assert np.abs(theta).max() <= math.pi
+    assert np.abs(episode.states[:, 1]).max() > 1.0
+    turned = np.unwrap(theta)
+    assert np.abs(turned[-1] - turned[0]) > 0.1
+    speed = np.diff(turned) / episode.task.time_step
+    np.testing.assert_allclose(speed, episode.states[1:, 1], atol=1e-3)
+
+
+def test_an_episode_in_a_gymnasium_world():
+    """Pendulum-v1 is the pendulum without friction and with a limit, step for step."""
+    task = replace(PENDULUM, velocity_limits={"theta_dot": 8.0})
+    world = GymnasiumWorld(task, GymnasiumConfig("Pendulum-v1"))
+    episode = play_episode(constant(1.5), task, world=world, max_steps=60)
+    assert episode.states.shape == (61, 2)
+    assert episode.actions.shape == (60, 1)
+    assert not episode.terminated
+    states, actions = torch.from_numpy(episode.states), torch.from_numpy(episode.actions)
+    simulated = SimulatedWorld(task, SimulatedConfig(friction={"joint": 0.0}))
+    expected = simulated.step(states[:-1], actions)
+    assert task.difference(states[1:], expected).abs().max() < 1e-4
+    assert states[:, 1].max() == 8.0, "the limit was met"
+    rewards = task.reward(states[:-1], actions, states[1:]).numpy()
+    np.testing.assert_allclose(episode.rewards, rewards, atol=1e-4)
+    again = play_episode(constant(1.5), task, world=world, max_steps=60)
+    assert np.array_equal(again.states, episode.states)
+
+
+def test_an_episode_ends_with_the_tasks_time_in_any_world():
+    task = replace(PENDULUM, max_steps=7)
+    for world in (None, GymnasiumWorld(task, GymnasiumConfig("Pendulum-v1"))):
+        assert len(play_episode(constant(), task, world=world).rewards) == 7
+        assert len(play_episode(constant(), task, world=world, max_steps=99).rewards) == 7
+
+
+# Pictures.
+
+
+def test_frames_are_subsampled_and_limited():
+    pytest.importorskip("pygame")
+    options = {"max_steps": 25, "render": True}
+    episode = play_episode(constant(), "cartpole-swingup", frames_per_second=10, **options)
+    assert episode.frame_steps == 5
+    assert len(episode.frames) == 6
+    assert len(play_episode(constant(), "acrobot", max_frames=3, **options).frames) == 3
+
+
+def test_pictures_without_pygame(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"pygame: .*phihp_torchrl\[rendering\]"):
+        play_episode(constant(), "pendulum", render=True)
+    assert len(play_episode(constant(), "pendulum", max_steps=2).rewards) == 2
+
+
+def test_pictures_of_a_gymnasium_world():
+    pytest.importorskip("pygame")
+    world = GymnasiumWorld(PENDULUM, GymnasiumConfig("Pendulum-v1"))
+    episode = play_episode(constant(2.0), PENDULUM, world=world, max_steps=12, render=True)
+    assert episode.frames.shape == (13, 500, 500, 3)
+    assert episode.frames.dtype == np.uint8
+    assert (episode.frames[0] != episode.frames[-1]).any(), "nothing moves"
+
+
+def test_a_world_that_draws_nothing_says_so():
+    world = EnvWorld(PENDULUM, SimulatedWorld(PENDULUM).make_env, label="my robot")
+    with pytest.raises(ValueError, match=r"render: expected a world that draws .* my robot draws"):
+        play_episode(constant(), PENDULUM, world=world, render=True)

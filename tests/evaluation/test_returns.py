@@ -1,0 +1,189 @@
+"""What a policy earns, in the simulated world and in every other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import GymEnv
+
+from phihp_torchrl import evaluate, get_task
+from phihp_torchrl.agents import Actor, make_actor
+from phihp_torchrl.evaluation import measure_latency, play_episode
+from phihp_torchrl.tasks import list_tasks
+from phihp_torchrl.worlds import (
+    EnvWorld,
+    GymnasiumConfig,
+    GymnasiumWorld,
+    SimulatedConfig,
+    SimulatedWorld,
+)
+
+from .policies import Noisy, balance, constant, planner
+
+
+def test_returns_by_hand():
+    # Without a push the pole falls; every step counts 1, the last included.
+    result = evaluate(constant(), "cartpole", episodes=20)
+    assert torch.equal(result.returns, result.lengths.to(torch.float64))
+    assert result.terminated.all()
+    assert 5 < result.mean < 200
+    result = evaluate(balance(), "cartpole", episodes=8)
+    assert result.returns.tolist() == [500.0] * 8
+    assert not result.terminated.any(), "running out of steps is not termination"
+    assert (result.mean, result.std, result.standard_error) == (500.0, 0.0, 0.0)
+    # One step of a pendulum, by its reward.
+    task = replace(get_task("pendulum"), max_steps=1)
+    state = task.reset.sample([6], generator=torch.Generator().manual_seed(3))
+    expected = -(state[:, 0].square() + 0.1 * state[:, 1].square() + 0.001 * 1.5**2)
+    result = evaluate(constant(1.5), task, episodes=6, seed=3)
+    torch.testing.assert_close(result.returns, expected.to(torch.float64))
+
+
+@pytest.mark.parametrize("name", list_tasks())
+def test_the_fast_way_is_the_environments_way(name):
+    task = replace(get_task(name), max_steps=60)
+    policy = Actor(task, (8,))
+    policy = TensorDictModule(policy, ["observation"], ["action"])
+    fast = evaluate(policy, task, episodes=6, seed=5)
+    slow = evaluate(policy, task, episodes=6, seed=5, env=SimulatedWorld(task).make_batch([6]))
+    torch.testing.assert_close(fast.returns, slow.returns, rtol=1e-4, atol=1e-4)
+    assert torch.equal(fast.lengths, slow.lengths)
+    assert torch.equal(fast.terminated, slow.terminated)
+
+
+def test_rewards_after_the_end_do_not_count():
+    task = replace(
+        get_task("cartpole"),
+        terminated=lambda state: state[..., 2].abs() > 0.01,
+        reward=lambda state, action, next_state: state[..., 2].abs() * 1e3,
+    )
+    for env in (None, SimulatedWorld(task).make_batch([20])):
+        result = evaluate(constant(), task, episodes=20, env=env)
+        assert result.terminated.all()
+        assert (result.returns <= 1e3 * (0.01 * (result.lengths - 1) + 0.05)).all()
+
+
+def test_seeds_reproduce_and_pair():
+    agent = planner(warm_start=True)
+    task = replace(agent.task, max_steps=15)
+    first = evaluate(agent, task, episodes=4, seed=1)
+    assert torch.equal(first.returns, evaluate(agent, task, episodes=4, seed=1).returns)
+    assert not torch.equal(first.returns, evaluate(agent, task, episodes=4, seed=2).returns)
+    # Without randomness in the policy the same starts mean the same returns, alone or in a batch.
+    start = replace(task, max_steps=1)
+    still = evaluate(constant(), start, episodes=4, seed=1).returns
+    assert torch.equal(still, evaluate(constant(), start, episodes=7, seed=1).returns[:4])
+
+
+def test_a_policy_without_noise_does_not_see_the_batch():
+    task = replace(get_task("cartpole-swingup"), max_steps=40)
+    policy = TensorDictModule(Actor(task, (8,)), ["observation"], ["action"])
+    whole = evaluate(policy, task, episodes=6, seed=1)
+    part = evaluate(policy, task, episodes=3, seed=1)
+    torch.testing.assert_close(whole.returns[:3], part.returns)
+
+
+def test_the_global_random_state_is_left_alone():
+    task = replace(get_task("pendulum"), max_steps=3)
+    before = torch.get_rng_state()
+    evaluate(Noisy(), task, episodes=2)
+    evaluate(Noisy(), task, episodes=2, env=SimulatedWorld(task).make_batch([2], seed=0))
+    measure_latency(Noisy(), task, calls=2, warmup=0)
+    play_episode(Noisy(), task)
+    assert torch.equal(before, torch.get_rng_state())
+
+
+# Other worlds.
+
+
+def test_a_world_of_other_constants_is_another_world():
+    task = replace(get_task("pendulum"), max_steps=60)
+    policy = make_actor(task, (8,))
+    here = evaluate(policy, task, episodes=6, seed=5)
+    same = evaluate(policy, task, episodes=6, seed=5, world=SimulatedWorld(task))
+    assert torch.equal(here.returns, same.returns)
+    config = SimulatedConfig(constants={"mass": 1.5}, friction={"joint": 0.5})
+    heavy = SimulatedWorld(task, config)
+    there = evaluate(policy, task, episodes=6, seed=5, world=heavy)
+    assert (there.returns - here.returns).abs().min() > 1e-3
+    slow = evaluate(policy, task, episodes=6, seed=5, env=heavy.make_batch([6]))
+    torch.testing.assert_close(there.returns, slow.returns, rtol=1e-4, atol=1e-4)
+
+
+def test_a_world_that_is_not_simulated_plays_one_episode_after_another():
+    task = replace(get_task("pendulum"), max_steps=25)
+    world = GymnasiumWorld(task, GymnasiumConfig("Pendulum-v1"))
+    result = evaluate(constant(1.5), task, episodes=3, seed=4, world=world)
+    assert result.lengths.tolist() == [25] * 3
+    assert not result.terminated.any()
+    again = evaluate(constant(1.5), task, episodes=3, seed=4, world=world)
+    assert torch.equal(result.returns, again.returns)
+    assert len(set(result.returns.tolist())) == 3, "each starts elsewhere"
+    other = evaluate(constant(1.5), task, episodes=3, seed=5, world=world)
+    assert not torch.equal(result.returns, other.returns)
+    # An episode played to be looked at is the first of them.
+    episode = play_episode(constant(1.5), task, seed=4, world=world)
+    assert episode.total_reward == pytest.approx(result.returns[0].item(), rel=1e-5)
+
+
+def test_an_environment_may_be_a_world():
+    task = replace(get_task("cartpole"), max_steps=120)
+    world = EnvWorld(task, SimulatedWorld(task).make_env)
+    policy = Noisy()
+    result = evaluate(policy, task, episodes=4, seed=0, world=world)
+    assert sum(int(start) for start in policy.starts) == 4
+    assert torch.equal(result.returns, result.lengths.to(torch.float64))
+    assert (result.lengths < 120).any()
+    assert torch.equal(result.terminated, result.lengths < 120)
+
+
+@pytest.mark.parametrize("batch", [[], [2], [5]])
+def test_other_environments_play_rounds(batch):
+    task = replace(get_task("cartpole"), max_steps=30)
+    policy = Noisy()
+    result = evaluate(policy, task, episodes=5, seed=0, env=SimulatedWorld(task).make_batch(batch))
+    assert result.returns.shape == result.lengths.shape == (5,)
+    assert policy.starts[0].all()
+    assert not policy.starts[1].any()
+    if batch == []:
+        assert sum(int(start) for start in policy.starts) == 5
+    assert torch.equal(result.returns, result.lengths.to(torch.float64))
+
+
+def test_gymnasium_worlds_play_too():
+    env = GymEnv("phihp/CartPole-v0")
+    result = evaluate(constant(), "cartpole", episodes=2, env=env)
+    assert result.terminated.all()
+    assert torch.equal(result.returns, result.lengths.to(torch.float64))
+
+
+# What is told, and what is refused.
+
+
+def test_summary_is_numbers():
+    summary = evaluate(constant(), "cartpole", episodes=3).summary()
+    assert all(isinstance(value, float) and math.isfinite(value) for value in summary.values())
+    assert summary["return_min"] <= summary["return_mean"] <= summary["return_max"]
+    assert evaluate(constant(), "cartpole", episodes=1).std == 0.0
+
+
+def test_bad_arguments_are_named():
+    for episodes in (0, -1, 1.5, True):
+        with pytest.raises(ValueError, match="episodes: expected a positive whole number"):
+            evaluate(constant(), "cartpole", episodes=episodes)
+    with pytest.raises(ValueError, match="task: expected one of"):
+        evaluate(constant(), "no-such-task")
+    with pytest.raises(ValueError, match="env: expected batch size"):
+        evaluate(constant(), "cartpole", env=SimulatedWorld("cartpole").make_batch([2, 2]))
+    with pytest.raises(ValueError, match="calls: expected"):
+        measure_latency(constant(), "cartpole", calls=0)
+    with pytest.raises(ValueError, match="warmup: expected"):
+        measure_latency(constant(), "cartpole", warmup=-1)
+    with pytest.raises(ValueError, match="max_steps: expected"):
+        play_episode(constant(), "cartpole", max_steps=0)
+    with pytest.raises(ValueError, match="frames_per_second: expected"):
+        play_episode(constant(), "cartpole", frames_per_second=0)

@@ -1,0 +1,130 @@
+"""Runs: what they leave behind, repeat, refuse, and compile."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torchrl.checkpoint import CheckpointError
+
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.deployment import load_agent
+from phihp_torchrl.trainers import ModelConfig, run
+from phihp_torchrl.trainers.checkpoints import load_state
+
+from .run_parts import CONFIG, EVALUATE, POLICY, UNITS, assert_equal, rows, with_sections
+
+# Whole runs
+
+
+def test_a_run_leaves_what_it_promises(whole: Path) -> None:
+    names = {"config.yaml", "metadata.json", "metrics.csv", "evaluation.json", "episode.png"}
+    assert names | {"agent", "phases", "checkpoints"} == {p.name for p in whole.iterdir()}
+    assert not list((whole / "checkpoints").iterdir())
+    metadata = json.loads((whole / "metadata.json").read_text())
+    assert metadata["seconds"].keys() == {"model", "policy", "evaluate"}
+    session = metadata["sessions"][0]
+    assert session.keys() >= {"seed", "commit", "dirty", "command", "machine", "versions"}
+    table = rows(whole)
+    assert [row["unit"] for row in table] == [str(i) for i in range(UNITS)]
+    assert [row["real_steps"] for row in table] == ["30"] + ["60"] * (UNITS - 1)
+    agent = load_agent(whole / "agent")
+    assert agent.metadata["samples"] == 60
+    assert agent.metadata["config"]["policy"]["updates"] == 12
+    assert len(agent.metadata["returns"]["planner"]["returns"]) == 2
+
+
+def test_a_seed_repeats_a_run_and_another_does_not(whole: Path, tmp_path: Path) -> None:
+    model = replace(CONFIG, phases=("model",))
+    torch.rand(3)  # what happened before does not matter
+    run(model, tmp_path / "same")
+    run(replace(model, seed=1), tmp_path / "other")
+    assert rows(tmp_path / "same") == [
+        {k: row[k] for k in rows(tmp_path / "same")[0]} for row in rows(whole)[:2]
+    ]
+    assert rows(tmp_path / "other") != rows(tmp_path / "same")
+
+
+def test_a_phase_alone_does_what_it_did_in_the_whole_run(whole: Path, tmp_path: Path) -> None:
+    later = replace(CONFIG, phases=("policy", "evaluate"), start_from=str(whole))
+    # The settings of the phases done elsewhere are those they were done with.
+    run(with_sections(later, model=ModelConfig(real_steps=999)), tmp_path / "later")
+    ours = load_state(tmp_path / "later" / "phases" / "policy", metadata={"task": CONFIG.task})
+    theirs = load_state(whole / "phases" / "policy", metadata={"task": CONFIG.task})
+    assert_equal(ours["trainer"], theirs["trainer"])
+    run(replace(CONFIG, phases=("evaluate",), start_from=str(whole)), tmp_path / "last")
+    ours, theirs = (
+        (p / "agent/weights.safetensors").read_bytes() for p in (whole, tmp_path / "last")
+    )
+    assert ours == theirs
+
+
+def test_resuming_a_finished_run_changes_nothing(whole: Path) -> None:
+    before = (whole / "metrics.csv").read_bytes()
+    assert run(CONFIG, whole, resume=True).finished
+    assert (whole / "metrics.csv").read_bytes() == before
+
+
+# Refusing
+
+
+def test_resuming_with_another_configuration_names_the_key(whole: Path) -> None:
+    other = with_sections(CONFIG, policy=replace(POLICY, batch_size=9))
+    with pytest.raises(ConfigError, match=r"policy\.batch_size: 9, not 8"):
+        run(other, whole, resume=True)
+
+
+def test_a_directory_with_a_run_is_not_overwritten(whole: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="resume="):
+        run(CONFIG, whole)
+    (tmp_path / "thesis.tex").write_text("...")
+    with pytest.raises(ConfigError, match="run_dir: expected an empty"):
+        run(CONFIG, tmp_path)
+
+
+def test_resume_needs_a_run(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no config\.yaml"):
+        run(CONFIG, tmp_path, resume=True)
+
+
+def test_from_needs_the_phases_before_of_the_same_task(whole: Path, tmp_path: Path) -> None:
+    run(replace(CONFIG, phases=("model",)), tmp_path / "model")
+    last = replace(CONFIG, phases=("evaluate",), start_from=str(tmp_path / "model"))
+    with pytest.raises(CheckpointError, match="phases/policy"):
+        run(last, tmp_path / "x")
+    with pytest.raises(ConfigError, match="brief-pendulum"):
+        run(replace(last, task="pendulum", start_from=str(whole)), tmp_path / "x")
+    assert not (tmp_path / "x").exists()
+
+
+# Compiled
+
+
+def test_no_graph_breaks_and_none_is_compiled_twice(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A whole run; a break would fail it, for every graph is a full one."""
+    compile = torch.compile
+
+    def aot_compile(function: Any, *, fullgraph: bool, dynamic: bool, **_: Any) -> Any:
+        return compile(function, fullgraph=fullgraph, dynamic=dynamic, backend="aot_eager")
+
+    monkeypatch.setattr(torch, "compile", aot_compile)
+    torch._dynamo.reset()
+    torch._dynamo.utils.counters.clear()
+    timed = replace(EVALUATE, latency_actions=2)
+    config = with_sections(replace(CONFIG, compile=True), evaluate=timed)
+    with torch._dynamo.config.patch(error_on_recompile=True):
+        assert run(config, tmp_path / "compiled").finished
+    counters = torch._dynamo.utils.counters
+    assert not counters["graph_break"]
+    # The TD3 step, imagined chunks, returns in model and world, and plans for 2 worlds and for one.
+    assert counters["stats"]["unique_graphs"] == 6
+    for ours, eager in zip(rows(tmp_path / "compiled"), rows(whole), strict=True):
+        for key, value in eager.items():
+            if value and key != "phase":
+                assert float(ours[key]) == pytest.approx(float(value), rel=1e-3, abs=1e-3), key
