@@ -3,9 +3,9 @@
     python docs/departures.py
 
 It compares the two presets on every task and rewrites the table of docs/recipes.md: the settings
-from the YAML files, the measured effects from results/departures/. The column "why" is people's and
-stays as it is; a departure that is new gets an empty reason. mkdocs runs it as a hook, which only
-checks: a table that is out of date or a departure without a reason stops the build.
+as runs compose them, the measured effects from results/departures/. The column "why" is people's
+and stays as it is; a departure that is new gets an empty reason. mkdocs runs it as a hook, which
+only checks: a table that is out of date or a departure without a reason stops the build.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from typing import Any
 
 import yaml
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "recipes"))
-from presets import settings  # noqa: E402  (there since the line above)
+from phihp_torchrl.config import YAML, flatten, load_config
 
+ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "recipes.md"
 START, END = "<!-- departures:start -->\n", "<!-- departures:end -->"
 HEADER = "| # | key | paper | default | why | measured effect |\n|---:|:---|:---|:---|:---|:---|\n"
@@ -30,12 +29,18 @@ EFFECTS = ROOT / "results" / "departures" / "departures.json"
 def departures() -> dict[str, tuple[str, str]]:
     """The published and our settings of each key in which some task departs, as Markdown."""
     paper, ours = settings("paper"), settings("default")
-    tasks = [task for task in paper["model.real_steps"] if task]
     return {
         key: (_describe(paper[key]), _describe(ours[key]))
         for key in ours
-        if key != "preset" and any(paper[key][task] != ours[key][task] for task in tasks)
+        if key not in ("task", "preset") and paper[key] != ours[key]
     }
+
+
+def settings(preset: str) -> dict[str, dict[str, Any]]:
+    """The value of each key by task, as ``phihp train`` composes it."""
+    tasks = sorted(path.stem for path in (YAML / "task").glob("*.yaml"))
+    layers = {task: flatten(load_config(task, preset=preset)) for task in tasks}
+    return {key: {task: layer[key] for task, layer in layers.items()} for key in layers[tasks[0]]}
 
 
 def table(page: str) -> str:
@@ -80,17 +85,18 @@ def _unexplained(page: str) -> list[str]:
 
 
 def _describe(values: dict[str, Any]) -> str:
-    """The common value first, then the tasks that have another."""
-    groups: dict[str, list[str]] = {_show(values[""]): []}
+    """The value that most tasks have first, then the tasks that have another."""
+    groups: dict[str, list[str]] = {}
     for task, value in values.items():
-        if task:
-            groups.setdefault(_show(value), []).append(task)
-    groups = {value: tasks for value, tasks in groups.items() if tasks}
+        groups.setdefault(_show(value), []).append(task)
     if len(groups) == 1:
         return f"`{next(iter(groups))}`"
-    common, *others = groups if groups.get(_show(values[""])) else ["", *groups]
-    texts = [f"`{common}`"] if common else []
-    return "; ".join([*texts, *(f"`{value}` ({', '.join(groups[value])})" for value in others)])
+    sizes = sorted((len(tasks) for tasks in groups.values()), reverse=True)
+    first, texts = sizes[0] > sizes[1], []
+    for value, tasks in sorted(groups.items(), key=lambda group: -len(group[1])):
+        texts.append(f"`{value}`" if first else f"`{value}` ({', '.join(tasks)})")
+        first = False
+    return "; ".join(texts)
 
 
 def _show(value: Any) -> str:

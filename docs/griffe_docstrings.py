@@ -21,6 +21,8 @@ class Docstrings(Extension):
         """Rewrite one docstring."""
         if obj.docstring is not None:
             text = obj.docstring.value.replace("``", "`")
+            if obj.is_class and any(str(base) == "NamedTuple" for base in obj.bases):
+                text = text.replace("Args:\n", "Attributes:\n")  # it has no signature of its own
             obj.docstring.value = _MATH.sub(_formula, _ROLE.sub(r"`\1`", text))
 
 
