@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,25 @@ def publish_offers(*config_dirs: str | Path) -> None:
         file = Path(group, f"{name}.yaml")
         if not any((Path(place) / file).is_file() for place in (YAML, *config_dirs)):
             store.store(name, content, group=group, package="_global_")
+
+
+@contextmanager
+def published_offers(*config_dirs: str | Path) -> Iterator[None]:
+    """Publish the offers for the time of one composition.
+
+    Other applications of Hydra in the same process, such as a grid whose keys have the names of our
+    groups, must not find them.
+    """
+    repo = ConfigStore.instance().repo
+    groups = {group for group, _ in _OFFERED}
+    before = {group: dict(repo[group]) for group in groups if group in repo}
+    publish_offers(*config_dirs)
+    try:
+        yield
+    finally:
+        for group in groups:
+            repo.pop(group, None)
+        repo.update(before)
 
 
 def choices_of(group: str, config_dir: str | Path | None = None) -> list[str]:

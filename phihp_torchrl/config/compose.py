@@ -20,7 +20,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from phihp_torchrl.config.choices import choices_of, publish_offers
+from phihp_torchrl.config.choices import choices_of, published_offers
 from phihp_torchrl.config.errors import ConfigError
 from phihp_torchrl.config.typed import flatten
 
@@ -78,11 +78,14 @@ def compose_yaml(overrides: Sequence[str], config_dir: str | Path | None = None)
         ConfigError: for a key, value or file that Hydra refuses; the message names it.
     """
     lines = open_mappings(overrides)
-    publish_offers(*([] if config_dir is None else [config_dir]))
+    places = [] if config_dir is None else [config_dir]
     if config_dir is not None:
         lines.append(f"hydra.searchpath=[{_quoted(f'file://{Path(config_dir).absolute()}')}]")
     try:
-        with initialize_config_module(MODULE, version_base="1.3"):
+        with (
+            published_offers(*places),
+            initialize_config_module(MODULE, version_base="1.3"),
+        ):
             return compose("train", lines)
     except (HydraException, OmegaConfBaseException) as error:
         raise _explain(overrides, config_dir, error) from error
