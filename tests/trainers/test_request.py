@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 from omegaconf import OmegaConf
 
 from phihp_torchrl.config import METHODS, ConfigError, compose_yaml
@@ -77,14 +76,11 @@ def test_a_run_goes_on_in_its_own_world(tmp_path: Path) -> None:
     assert run(first, tmp_path / "part", resume=True).finished
     later = replace(ours, phases=("evaluate",), start_from=str(tmp_path / "part"))
     run(later, tmp_path / "last")
-    whole, last, other = (
+    whole, last = (
         json.loads((tmp_path / name / "evaluation.json").read_text())["planner"]["returns"]
-        if (tmp_path / name).exists()
-        else None
-        for name in ("whole", "last", "other")
+        for name in ("whole", "last")
     )
     assert whole == last
-    assert other is None
     with pytest.raises(ConfigError, match=r"world\.friction\.joint: None, not 2\.0"):
         run(replace(first, world=SimulatedConfig()), tmp_path / "part", resume=True)
 
@@ -167,10 +163,7 @@ def test_what_every_committed_run_earned_is_still_read() -> None:
 
 def test_a_run_without_an_evaluation_earned_nothing_yet(tmp_path: Path) -> None:
     run(replace(CONFIG, phases=("model",)), tmp_path / "run")
-    torch.rand(1)
     assert read_result(tmp_path / "run") is None
-    with pytest.raises(ConfigError, match=r"no config\.yaml"):
-        read_result(tmp_path / "nowhere") or RunDirectory(tmp_path / "nowhere").read_config()
 
 
 def test_what_was_earned_in_another_world_is_called_by_it(tmp_path: Path) -> None:
