@@ -1,0 +1,81 @@
+"""Recorded episodes: the samples of a log, in the units of a system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.config import ConfigError
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The samples of one uninterrupted stretch of an episode.
+
+    A gap in the samples ends a recording, and a later one with the same ``episode`` goes on after
+    it, so that nothing is ever bridged. A sample whose command is missing cannot be used at all; a
+    sample of which a state is missing is kept, with NaN in that component.
+
+    Args:
+        time: times of the samples in seconds, strictly increasing, float64 ``[T]``.
+        state: measured states, in the order and in the units of the system, float64 ``[T, n]``;
+            NaN where a component was not measured.
+        action: commands in physical units, float64 ``[T, m]``; command ``i`` was given at time
+            ``i`` and held until time ``i + 1``. The last one has no known duration.
+        source: where the samples are from, for messages: a file, or an environment.
+        episode: number of the episode.
+
+    Raises:
+        ConfigError: for shapes that do not belong together, times that do not increase, commands
+            that are not finite, or fewer than two samples.
+
+    Examples:
+        >>> time = torch.arange(3, dtype=torch.float64)
+        >>> swing = Recording(time, torch.zeros(3, 2), torch.zeros(3, 1), source="swing.csv")
+        >>> len(swing), swing.intervals.tolist()
+        (3, [1.0, 1.0])
+    """
+
+    time: Tensor
+    state: Tensor
+    action: Tensor
+    source: str = "recording"
+    episode: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("time", "state", "action"):
+            object.__setattr__(self, name, torch.as_tensor(getattr(self, name)).double())
+        length = len(self.time)
+        if length < 2:
+            raise ConfigError("time", f"{self.source}: expected two samples or more, got {length}.")
+        for name in ("state", "action"):
+            shape = list(getattr(self, name).shape)
+            if len(shape) != 2 or shape[0] != length:
+                raise ConfigError(
+                    name, f"{self.source}: expected shape [{length}, ...], got {shape}."
+                )
+        late = (self.time.diff() <= 0).nonzero()
+        if len(late):
+            at = int(late[0])
+            raise ConfigError(
+                "time",
+                f"{self.source}: expected increasing times, got {self.time[at]:g} and then "
+                f"{self.time[at + 1]:g} at sample {at + 1}.",
+            )
+        if not self.action.isfinite().all():
+            raise ConfigError("action", f"{self.source}: expected finite commands in each sample.")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def intervals(self) -> Tensor:
+        """Seconds between samples, ``[T - 1]``."""
+        return self.time.diff()
+
+    @property
+    def measured(self) -> Tensor:
+        """Which components of the state were ever measured, bool ``[n]``."""
+        return self.state.isfinite().any(0)
