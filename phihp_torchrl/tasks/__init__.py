@@ -3,9 +3,19 @@
 from __future__ import annotations
 
 from phihp_torchrl.tasks import acrobot, cartpole, pendulum  # (they register themselves)
+from phihp_torchrl.tasks.actuator import Actuator
 from phihp_torchrl.tasks.base import RewardFn, Step, Task, TerminatedFn, Transition
 from phihp_torchrl.tasks.bounds import ActionBounds
 from phihp_torchrl.tasks.box import Box
 from phihp_torchrl.tasks.registry import find_task, get_task, list_tasks, register_task
 
-__all__ = ["ActionBounds", "Box", "Task", "Transition", "get_task", "list_tasks", "register_task"]
+__all__ = [
+    "ActionBounds",
+    "Actuator",
+    "Box",
+    "Task",
+    "Transition",
+    "get_task",
+    "list_tasks",
+    "register_task",
+]

@@ -253,7 +253,9 @@ class ModelTrainer:
             state = torch.zeros(0, self.task.state_dim)
             action = torch.zeros(0, self.task.action_dim)
             return Batch(state, action, torch.zeros(0), state, torch.zeros(0, dtype=torch.bool))
-        state, action, next_state = self.loss.transitions(self.data)
+        state = self.task.locate(self.data["observation"])
+        next_state = self.task.locate(self.data["next", "observation"])
+        action = self.data["action"]
         # "done" in the data includes truncations, which are not terminations.
         terminated = self.task.is_terminated(next_state)
         return Batch(state, action, self.data["next", "reward"][:, 0], next_state, terminated)
