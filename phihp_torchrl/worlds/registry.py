@@ -81,7 +81,8 @@ def make_world(task: str | Task, world: Any = "simulated") -> World:
             one, or a :class:`World`.
 
     Raises:
-        ConfigError: for a kind that is not registered, or settings that it does not have.
+        ConfigError: for a kind that is not registered, settings that it does not have, or a
+            :class:`World` of another task.
 
     Examples:
         >>> str(make_world("pendulum", {"kind": "gymnasium", "id": "Pendulum-v1"}))
@@ -92,6 +93,10 @@ def make_world(task: str | Task, world: Any = "simulated") -> World:
     """
     task = find_task(task)
     if isinstance(world, World):
+        if world.task.name != task.name:
+            raise ConfigError(
+                "world", f"expected a world of task {task.name!r}, got one of {world.task.name!r}."
+            )
         return world
     if isinstance(world, str):
         WORLDS.find(world)
