@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, ClassVar
 
 import gymnasium
@@ -102,7 +103,7 @@ class SimulatedWorld(World):
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
-        return self.oracle()(state, action)
+        return self._dynamics(state, action)
 
     def make_env(self, *, render: bool = False) -> EnvBase:
         env = gymnasium.make(
@@ -139,3 +140,8 @@ class SimulatedWorld(World):
         """
         env = WorldModelEnv(self.model(), batch_size=batch_size, device=device, seed=seed)
         return TransformedEnv(env, Compose(StepCounter(max_steps=self.task.max_steps), RewardSum()))
+
+    @cached_property
+    def _dynamics(self) -> HybridDynamics:
+        # An oracle that nobody else has, so that nobody moves it to another device.
+        return self.oracle()
