@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, GymWrapper, RewardSum, StepCounter, TransformedEnv
 
-from phihp_torchrl.config import ConfigError, check_choice, check_count
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.imagination import WorldModelEnv
-from phihp_torchrl.integrators import INTEGRATORS, FixedStepIntegrator, Integrator, make_integrator
+from phihp_torchrl.integrators import check_integrator, integrator_of
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.simulated.plant import Plant, PlantPhysics, find_plant
@@ -49,10 +49,7 @@ class SimulatedConfig:
     friction: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        check_choice(self, "integrator", INTEGRATORS)
-        check_count(self, "substeps")
-        if self.substeps > 1 and not issubclass(INTEGRATORS[self.integrator], FixedStepIntegrator):
-            raise ConfigError("substeps", f"expected 1 for {self.integrator}, got {self.substeps}.")
+        check_integrator(self)
 
 
 class SimulatedWorld(World):
@@ -84,8 +81,7 @@ class SimulatedWorld(World):
         except ConfigError as error:
             key = error.key.replace("coefficients", "friction", 1)  # as the settings call them
             raise ConfigError(f"world.{key}", error.reason) from error
-        settings = {"substeps": config.substeps} if config.substeps > 1 else {}
-        self.integrator: Integrator = make_integrator(config.integrator, **settings)
+        self.integrator = integrator_of(config)
 
     @property
     def truth(self) -> Plant:
