@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 import phihp_torchrl.tdmpc  # noqa: F401  (it registers its phase)
-from phihp_torchrl.config import METHODS, YAML, sentences_of
+from phihp_torchrl.config import METHODS, YAML, default_of, sentences_of
 from phihp_torchrl.planners import PLANNERS
 from phihp_torchrl.trainers import PHASES, LoggerConfig, RunConfig
 from phihp_torchrl.worlds import WORLDS
@@ -95,7 +95,7 @@ def _section(
         key = f.metadata.get("key", f.name)
         if not f.init or f.name in leave_out:
             continue
-        value = (changed or {}).get(f.name, _default(f))
+        value = (changed or {}).get(f.name, default_of(f))
         sentence = words.get(f.name)
         if sentence is None:
             raise LookupError(f"{cls.__name__}.{f.name}: its docstring has no sentence for it.")
@@ -106,12 +106,6 @@ def _section(
             yield from _section(type(value), depth + 1)
         else:
             yield f"{indent}{key}: {_text(value)}"
-
-
-def _default(f: Field) -> Any:
-    if f.default is not MISSING:
-        return f.default
-    return "???" if f.default_factory is MISSING else f.default_factory()
 
 
 def _text(value: Any) -> str:

@@ -33,6 +33,7 @@ from phihp_torchrl.config.help import help_text, sentences, sentences_of, settin
 from phihp_torchrl.config.methods import METHODS, Method, get_method, register_method
 from phihp_torchrl.config.registry import Registry
 from phihp_torchrl.config.typed import (
+    default_of,
     differences,
     flatten,
     from_mapping,
