@@ -31,6 +31,7 @@ from phihp_torchrl.config.compose import (
 from phihp_torchrl.config.errors import ConfigError
 from phihp_torchrl.config.help import help_text, sentences, sentences_of, settings_text
 from phihp_torchrl.config.methods import METHODS, Method, get_method, register_method
+from phihp_torchrl.config.modules import import_named
 from phihp_torchrl.config.registry import Registry
 from phihp_torchrl.config.typed import (
     default_of,
