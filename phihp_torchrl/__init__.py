@@ -102,10 +102,7 @@ if "phihp/Task-v0" not in gymnasium.registry:
 def __getattr__(name: str) -> Any:
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = _HOME_OF[name]
-    if home == "trainers":
-        import_module(f"{__name__}.tdmpc")  # it registers the phase of TD-MPC
-    value = getattr(import_module(f"{__name__}.{home}"), name)
+    value = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
     globals()[name] = value
     return value
 

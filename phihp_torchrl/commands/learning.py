@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import phihp_torchrl.tdmpc  # noqa: F401  (it registers its phase)
 from phihp_torchrl.commands.words import read_lines
 from phihp_torchrl.config import ConfigError, kind_mapping, load_config, override_lines
 from phihp_torchrl.deployment import Agent, load_agent

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import os
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -22,7 +19,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, import_named
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.command_memory import command_memory
@@ -152,11 +149,8 @@ def import_object(key: str, name: str) -> Any:
         ConfigError: with ``key`` as its key, if there is no such object or its import fails.
     """
     module, _, attribute = name.partition(":")
-    here = os.getcwd()
-    if here not in sys.path:
-        sys.path.insert(0, here)
     try:
-        return getattr(importlib.import_module(module), attribute)
+        return getattr(import_named(module), attribute)
     # A user's module may raise anything; the message should name it and the reason.
     except Exception as error:
         raise ConfigError(

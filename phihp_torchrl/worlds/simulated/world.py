@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import gymnasium
@@ -12,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, GymWrapper, RewardSum, StepCounter, TransformedEnv
 
-from phihp_torchrl.config import ConfigError, check_choice, check_count
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.imagination import WorldModelEnv
-from phihp_torchrl.integrators import INTEGRATORS, FixedStepIntegrator, Integrator, make_integrator
+from phihp_torchrl.integrators import check_integrator, integrator_of
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.command_memory import command_memory
@@ -51,10 +52,7 @@ class SimulatedConfig:
     actuator: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        check_choice(self, "integrator", INTEGRATORS)
-        check_count(self, "substeps")
-        if self.substeps > 1 and not issubclass(INTEGRATORS[self.integrator], FixedStepIntegrator):
-            raise ConfigError("substeps", f"expected 1 for {self.integrator}, got {self.substeps}.")
+        check_integrator(self)
 
 
 class SimulatedWorld(World):
@@ -86,9 +84,8 @@ class SimulatedWorld(World):
         except ConfigError as error:
             key = error.key.replace("coefficients", "friction", 1)  # as the settings call them
             raise ConfigError(f"world.{key}", error.reason) from error
-        settings = {"substeps": config.substeps} if config.substeps > 1 else {}
         self.actuator = self.task.with_actuator(config.actuator).actuator
-        self.integrator: Integrator = make_integrator(config.integrator, **settings)
+        self.integrator = integrator_of(config)
 
     @property
     def truth(self) -> Plant:
@@ -110,7 +107,7 @@ class SimulatedWorld(World):
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
-        return self.oracle()(state, action)
+        return self._dynamics(state, action)
 
     def make_env(self, *, render: bool = False) -> EnvBase:
         env = gymnasium.make(
@@ -149,3 +146,8 @@ class SimulatedWorld(World):
         model = TaskWorldModel(replace(self.task, actuator=self.actuator), self.oracle())
         env = WorldModelEnv(model, batch_size=batch_size, device=device, seed=seed)
         return TransformedEnv(env, Compose(StepCounter(max_steps=self.task.max_steps), RewardSum()))
+
+    @cached_property
+    def _dynamics(self) -> HybridDynamics:
+        # An oracle that nobody else has, so that nobody moves it to another device.
+        return self.oracle()
