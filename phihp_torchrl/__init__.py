@@ -35,13 +35,14 @@ _HOMES = {
     "imagination": ("WorldModelEnv",),
     "planners": ("CEMPlanner", "MPPIPlanner", "register_planner"),
     "systems": ("Constant", "System"),
-    "tasks": ("Box", "Task", "get_task", "register_task"),
+    "tasks": ("Actuator", "Box", "Task", "get_task", "register_task"),
     "trainers": ("RunConfig", "RunResult", "register_phase", "run"),
     "worlds": ("Plant", "World", "make_world", "register_plant", "register_world"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Actuator",
     "Agent",
     "Box",
     "CEMPlanner",
