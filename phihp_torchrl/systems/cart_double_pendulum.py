@@ -37,14 +37,17 @@ class CartDoublePendulum(LagrangianSystem):
     }
 
     def lagrangian(self, state: Symbols, constants: Mapping[str, sympy.Symbol]) -> sympy.Expr:
-        x, theta1, theta2, x_dot, theta1_dot, theta2_dot = state
+        _, theta1, theta2, x_dot, theta1_dot, theta2_dot = state
         c = constants
         across, up = x_dot, sympy.Integer(0)  # velocity of the hinge that a rod hangs on
         energy, height = c["cart_mass"] * x_dot**2 / 2, sympy.Integer(0)
         rods = ((1, theta1, theta1_dot), (2, theta2, theta2_dot))
         for i, theta, theta_dot in rods:
             mass, length = c[f"mass{i}"], c[f"length{i}"]
-            run, rise = length * theta_dot * sympy.cos(theta), -length * theta_dot * sympy.sin(theta)
+            run, rise = (
+                length * theta_dot * sympy.cos(theta),
+                -length * theta_dot * sympy.sin(theta),
+            )
             speed2 = (across + run / 2) ** 2 + (up + rise / 2) ** 2
             spin2 = length**2 / 12 * theta_dot**2
             energy += mass * (speed2 + spin2) / 2

@@ -15,11 +15,8 @@ from typing import Any
 
 import platformdirs
 import sympy
-import torch
 from sympy.core.function import AppliedUndef
-from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
 from sympy.printing.pytorch import TorchPrinter
-from torch import Tensor
 
 from phihp_torchrl.config import ConfigError
 
@@ -55,13 +52,13 @@ class Mechanics:
             self._check("forces", force, {*self.state, *self.action, *self.constants})
 
     def _check(self, what: str, expression: sympy.Expr, known: set[sympy.Expr]) -> None:
-        left = expression.xreplace({symbol: sympy.Integer(1) for symbol in known})
-        unknown = {*left.free_symbols, *left.atoms(AppliedUndef, sympy.Derivative)}
-        if unknown:
+        rates = expression.atoms(sympy.Derivative) - known  # such as accelerations
+        left = expression.xreplace({part: sympy.Integer(1) for part in (*rates, *known)})
+        if unknown := {*rates, *left.free_symbols, *left.atoms(AppliedUndef)}:
             raise ConfigError(
                 what,
-                f"unknown {sorted(map(str, unknown))} in {expression}, expected some of "
-                f"{sorted(map(str, known))}.",
+                f"unknown {sorted(map(str, unknown))}, expected an expression of nothing but the "
+                "symbols that the method is given.",
             )
 
     @property
@@ -78,6 +75,8 @@ class Mechanics:
         SymPy's own ``lambdify`` goes the same way, by ``cse`` and the printer for torch; here the
         source is kept, and what that printer cannot yet print is printed.
         """
+        from sympy.physics.mechanics import LagrangesMethod  # half a second, and seldom needed
+
         method = LagrangesMethod(self.lagrangian, list(self.positions))
         method.form_lagranges_equations()
         n = len(self.positions)
@@ -208,6 +207,8 @@ def make_symbols(
         ConfigError: for a state that does not consist of positions and their velocities, and for
             a name that stands for two things.
     """
+    from sympy.physics.vector import dynamicsymbols
+
     names = [*state, *action, *constants]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ConfigError("state_names", f"expected names that differ, got {twice} twice.")
@@ -224,46 +225,3 @@ def make_symbols(
         tuple(sympy.Symbol(name, real=True) for name in group) for group in (action, constants)
     )
     return {name: found[name] for name in state}, actions, others
-
-
-def solve_positive(mass: list[list[Tensor]], right: list[Tensor]) -> list[Tensor]:
-    """Solve M x = r for a positive definite M, given by its lower triangle.
-
-    Up to :data:`LARGEST_UNROLLED` unknowns M = L D Lᵀ is written out as products of tensors
-    ``[*batch]``, which a compiler fuses with the equations around them. Beyond, LAPACK solves.
-
-    Args:
-        mass: row i of the lower triangle has i + 1 tensors ``[*batch]``.
-        right: the right side, n tensors ``[*batch]``.
-    """
-    n = len(right)
-    if n > LARGEST_UNROLLED:
-        rows = [[mass[max(i, j)][min(i, j)] for j in range(n)] for i in range(n)]
-        matrix = torch.stack([torch.stack(row, -1) for row in rows], -2)
-        return list(torch.linalg.solve(matrix, torch.stack(right, -1)).unbind(-1))
-    lower: list[list[Tensor]] = []
-    pivot: list[Tensor] = []
-    for i in range(n):
-        scaled: list[Tensor] = []  # L_ij D_j of row i
-        for j in range(i):
-            scaled.append(_less(mass[i][j], scaled, lower[j]))
-        lower.append([a / d for a, d in zip(scaled, pivot, strict=True)])
-        pivot.append(_less(mass[i][i], scaled, lower[i]))
-    y: list[Tensor] = []
-    for i in range(n):
-        y.append(_less(right[i], y, lower[i]))
-    x = [a / d for a, d in zip(y, pivot, strict=True)]
-    for i in reversed(range(n)):
-        x[i] = _less(x[i], x[i + 1 :], [lower[k][i] for k in range(i + 1, n)])
-    return x
-
-
-LARGEST_UNROLLED = 6
-"""Unknowns up to which :func:`solve_positive` writes the solution out."""
-
-
-def _less(value: Tensor, one: Sequence[Tensor], other: Sequence[Tensor]) -> Tensor:
-    """``value`` less the scalar product of two lists, the longer of which is cut."""
-    for a, b in zip(one, other, strict=False):
-        value = value - a * b
-    return value

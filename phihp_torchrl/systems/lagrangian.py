@@ -16,8 +16,8 @@ from phihp_torchrl.systems.derivation import (
     Mechanics,
     make_equations,
     make_symbols,
-    solve_positive,
 )
+from phihp_torchrl.systems.solve import solve_positive
 
 Symbols = tuple[sympy.Expr, ...]
 """Symbols of a state or of an action, in the order of its names."""
@@ -27,7 +27,8 @@ class LagrangianSystem(System):
     r"""A mechanical system whose equations of motion are derived from its energies.
 
     .. math::
-        \frac{d}{dt}\frac{\partial L}{\partial\dot q} - \frac{\partial L}{\partial q} = Q(q, \dot q, a)
+        \frac{d}{dt}\frac{\partial L}{\partial\dot q} - \frac{\partial L}{\partial q}
+        = Q(q, \dot q, a)
         \quad\Longleftrightarrow\quad M(q)\,\ddot q = f(q, \dot q, a)
 
     A subclass declares names, angles and constants as every :class:`System` does, and implements
@@ -41,7 +42,7 @@ class LagrangianSystem(System):
 
     Each component of the state is a position or the velocity of one. In the symbols of the state,
     a position is a function of time (``sympy.physics.mechanics.dynamicsymbols``) and a velocity is
-    its derivative, so that the frames, points and bodies of ``sympy.physics.mechanics`` can be used.
+    its derivative, so that frames, points and bodies of ``sympy.physics.mechanics`` can be used.
 
     Args:
         constants: first guesses that differ from the declared ones, by name.
@@ -102,14 +103,20 @@ class LagrangianSystem(System):
 
     def prior(self, state: Tensor, action: Tensor, constants: Constants) -> Tensor:
         mass, forcing = self._terms(state, action, constants)
-        acceleration = dict(
-            zip(self.velocity_of.values(), solve_positive(mass, forcing), strict=True)
-        )
-        rates: dict[str, Tensor] = {}
-        for name, velocity in self.velocity_of.items():
-            rates[name] = state[..., self.state_names.index(velocity)]
-        rates.update(acceleration)
+        index = self.state_names.index
+        rates = {name: state[..., index(velocity)] for name, velocity in self.velocity_of.items()}
+        rates |= zip(self.velocity_of.values(), solve_positive(mass, forcing), strict=True)
         return torch.stack([rates[name] for name in self.state_names], -1)
+
+    def impulse(self, position: str, state: Tensor, constants: Constants) -> Tensor:
+        """A column of the inverse mass matrix, per change of the stopped position's velocity."""
+        action = state.new_zeros(*state.shape[:-1], self.action_dim)
+        mass, forcing = self._terms(state, action, constants)
+        one, zero = torch.ones_like(forcing[0]), torch.zeros_like(forcing[0])
+        blow = [one if name == position else zero for name in self.velocity_of]
+        change = dict(zip(self.velocity_of, solve_positive(mass, blow), strict=True))
+        parts = {v: change[q] / change[position] for q, v in self.velocity_of.items()}
+        return torch.stack([parts.get(name, zero) for name in self.state_names], -1)
 
     def mass_matrix(self, state: Tensor, constants: Constants) -> Tensor:
         """M(q) ``[*batch, k, k]`` of the k positions, in the order of :attr:`velocity_of`.

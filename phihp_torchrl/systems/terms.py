@@ -1,9 +1,9 @@
 r"""Friction and stops, as terms of a prior: forces that a user adds where they act.
 
 Each function takes tensors in a :meth:`System.prior`, and SymPy's expressions in the
-:meth:`~phihp_torchrl.systems.LagrangianSystem.forces` of a Lagrangian. Coefficients may be constants
-of the system, which are then learned. All of them are continuous, and differentiable but for the kinks
-of :func:`stop`.
+:meth:`~phihp_torchrl.systems.LagrangianSystem.forces` of a Lagrangian. Coefficients may be
+constants of the system, which are then learned. All of them are continuous, and differentiable but
+for the kinks of :func:`stop`.
 
 Examples:
     >>> import torch

@@ -53,7 +53,9 @@ class TwoLinkArm(LagrangianSystem):
             height = -l1 * sympy.cos(shoulder) - reach * sympy.cos(total)
             return mass * ((across**2 + up**2) / 2 - c["gravity"] * height)
 
-        upper = c["mass1"] * l1 * (l1 * shoulder_dot**2 / 6 + c["gravity"] * sympy.cos(shoulder) / 2)
+        upper = (
+            c["mass1"] * l1 * (l1 * shoulder_dot**2 / 6 + c["gravity"] * sympy.cos(shoulder) / 2)
+        )
         turning = c["mass2"] * l2**2 / 12 * spin**2 / 2
         return upper + turning + body(c["mass2"], l2 / 2) + body(c["load"], l2)
 
