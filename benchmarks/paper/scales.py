@@ -13,9 +13,10 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import mean
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,7 +39,7 @@ class Wells(System):
         super().__init__()
         self.unit = unit
 
-    def prior(self, state, action, constants):
+    def prior(self, state: Tensor, action: Tensor, constants: Mapping[str, Any]) -> Tensor:
         """The equation of motion, which is all of the truth."""
         x, x_dot = (state / self.unit).unbind(-1)
         force = constants["stiffness"] * x - x**3 + action[..., 0]

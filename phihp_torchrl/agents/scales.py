@@ -83,7 +83,7 @@ class Scales:
 
 
 class ScaledModel(TaskWorldModel):
-    """A model whose observations and rewards, as functions of tensors, are in the units of networks.
+    """A model that gives, as functions of tensors, observations and rewards in the networks' units.
 
     Everything that trains networks reads the model through :meth:`observe` and :meth:`transition`.
     States and actions stay in physical units.
@@ -133,10 +133,10 @@ def measure_scales(
 ) -> Scales:
     """Measure the units of a task's networks from states that it visits.
 
-    A component of the observation whose half-range lies outside :data:`OBSERVATION_RANGE` is divided
-    by the nearest power of two; where zero is far from its range, the middle is subtracted too. The
+    A component of the observation whose half-range lies outside ``OBSERVATION_RANGE`` is divided by
+    the nearest power of two; where zero is far from its range, the middle is subtracted too. The
     cosine and the sine of an angle, and components that do not vary, are left alone. Rewards are
-    divided so that values of about ``horizon`` rewards lie within :data:`VALUE_RANGE`.
+    divided by one if values of about ``horizon`` rewards would lie outside ``VALUE_RANGE``.
 
     Args:
         model: the model, for observations and rewards.

@@ -17,11 +17,11 @@ from phihp_torchrl.agents import (
     CriticRefit,
     FlatReplay,
     RefitConfig,
+    Scales,
     TD3Config,
     act,
     copy_actor,
     copy_twin_qvalue,
-    Scales,
     learning_rate_scale,
     measure_scales,
     scaled,
@@ -163,8 +163,8 @@ class PolicyTrainer(TD3Trainer):
     its returns in the model, and training continues from these. The last fit gives the critics that
     the planner uses.
 
-    With ``config.scales`` the networks are trained in units of :class:`Scales`, which the actors and
-    critics that this returns contain already; metrics are in physical units.
+    With ``config.scales`` the networks are trained in units that are measured from the task's
+    coverage. The actors and critics that this returns, and its metrics, are in physical units.
 
     Args:
         task: the task.
