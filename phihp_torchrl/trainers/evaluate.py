@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from phihp_torchrl.config import check_count
 from phihp_torchrl.deployment import Agent, save_agent
 from phihp_torchrl.evaluation import evaluate, measure_latency, show_episode
+from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.context import Context
-from phihp_torchrl.trainers.model import ModelConfig
 from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
@@ -179,8 +179,8 @@ def _build(context: Context) -> Phase:
     if agent is None:
         agent = Agent(context.task, **parts, planner_config=config.planner, compile=config.compile)
     world, samples = context.world, real_steps(context.before)
-    model = config.sections.get("model")
-    guards = model.collect.exploration.guards if isinstance(model, ModelConfig) else {}
+    collect = getattr(config.sections.get("model"), "collect", None)
+    guards = collect.exploration.guards if isinstance(collect, CollectConfig) else {}
     if guards and world.truth is None:  # a simulated world is played as a model, which needs none
         world = GuardedWorld(world, guards)
     return EvaluatePhase(agent, config, context.settings, world, context.directory, samples)
