@@ -79,14 +79,15 @@ class GuardTransform(Transform):
 
     def _crossed(self, observation: Tensor) -> list[str]:
         state = self.task.system.locate(observation).tolist()
-        names = self.task.system.state_names
-        found = []
-        for name, value in zip(names, state, strict=True):
-            low, high = self.limits.get(name, (-math.inf, math.inf))
+        names, found = self.task.system.state_names, []
+        for name, (low, high) in self.limits.items():
+            value = state[names.index(name)]
             if value < low:
                 found.append(f"{name} below {low:g}")
-            elif not value <= high:  # a value that is no number cannot be trusted either
+            elif value > high:
                 found.append(f"{name} above {high:g}")
+            elif math.isnan(value):
+                found.append(f"{name} not a number")
         return found
 
 

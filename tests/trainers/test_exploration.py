@@ -233,7 +233,7 @@ def test_what_does_not_fit_the_task_is_refused_before_any_step(change, reason):
 def test_a_controller_has_a_trim_of_its_own_and_a_signal_is_not_held():
     with pytest.raises(ConfigError, match="trim: expected none beside a controller"):
         ExplorationConfig(trim=(0.0,), controller="rig:act")
-    with pytest.raises(ConfigError, match="random_hold: expected 1 with exploration.bandwidth"):
+    with pytest.raises(ConfigError, match="random_hold: expected 1 with"):
         CollectConfig(random_hold=2, exploration=ExplorationConfig(colour=1.0))
 
 

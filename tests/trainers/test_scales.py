@@ -1,4 +1,4 @@
-"""Phase 2 in units of its own: what it returns and logs is in physical units, and it learns alike."""
+"""Phase 2 in units of its own: it learns alike, and what it returns is in physical units."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def test_a_value_that_is_no_number_ends_an_episode():
     crossings = Counter()
     env = guard_env(EnvWorld(CARTPOLE, Broken).make_env(), CARTPOLE, {"x": 1.0}, crossings)
     assert len(env.rollout(10)) == 1
-    assert crossings == {"x above 1": 1}
+    assert crossings == {"x not a number": 1}
 
 
 def test_limits_are_read_and_refused_by_name():
