@@ -27,7 +27,6 @@ __all__ = [
     "CollectConfig",
     "Context",
     "EvaluateConfig",
-    "ExplorationConfig",
     "LoggerConfig",
     "ModelConfig",
     "ModelTrainer",
