@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.recordings.columns import Column
+from phihp_torchrl.recordings.reading import RecordedData, read_recordings
 from phihp_torchrl.recordings.recording import Recording
 
-__all__ = ["Recording"]
+__all__ = ["Column", "RecordedData", "Recording", "read_recordings"]
