@@ -89,7 +89,7 @@ def test_settings_reach_the_world():
     [
         (
             "magic",
-            r"world: expected one of \['given', 'gymnasium', 'recorded', 'simulated', 'torchrl'.*'magic'",
+            r"world: expected one of \['given', 'gymnasium', 'recorded', 'simulated', .*'magic'",
         ),
         ({"kind": "magic"}, r"world\.kind: expected one of .*'magic'"),
         ({"kind": "gymnasium"}, r"world\.id: missing"),
