@@ -13,6 +13,9 @@ from phihp_torchrl.dynamics.fitting import FitConfig, FitReport, fit
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.integrators import RK4, Integrator, SemiImplicitEuler
 
+AUTO = "auto"
+"""The name in settings of a choice by held-out error."""
+
 SOLVERS: tuple[Integrator, ...] = (
     SemiImplicitEuler(),
     SemiImplicitEuler(substeps=2),
@@ -43,6 +46,9 @@ class SolverTrial:
 
     integrator: Integrator
     report: FitReport
+
+    def __str__(self) -> str:
+        return f"{self.integrator} {self.report.held_out_error:.3g}"
 
 
 def fit_solver(

@@ -176,6 +176,10 @@ class Integrator(abc.ABC):
         """The arguments that make an equal one: ``make_integrator(name, **settings)``."""
         return dict(vars(self))
 
+    def __str__(self) -> str:
+        told = ", ".join(f"{name} {value:g}" for name, value in self.settings.items())
+        return f"{self.name} ({told})" if told else self.name
+
 
 class FixedStepIntegrator(Integrator):
     """A solver that divides each control step into ``substeps`` steps of equal length.
