@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from phihp_torchrl.tasks import acrobot, cartpole, pendulum  # (they register themselves)
+from phihp_torchrl.tasks.actuator import Actuator
 from phihp_torchrl.tasks.base import RewardFn, Step, Task, TerminatedFn, Transition
 from phihp_torchrl.tasks.bounds import ActionBounds
 from phihp_torchrl.tasks.box import Box

@@ -1,0 +1,18 @@
+"""What recordings say of a system: constants with intervals, the path of a command, errors."""
+
+from __future__ import annotations
+
+from phihp_torchrl.identification.parts import (
+    ActuatorEstimate,
+    ActuatorTrial,
+    Estimate,
+    Finding,
+    HorizonError,
+    Region,
+    Residuals,
+    Rollout,
+    StateError,
+)
+from phihp_torchrl.identification.result import Identification
+
+__all__ = ["Identification"]
