@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.identification.config import IdentifyConfig
+from phihp_torchrl.identification.identify import identify
 from phihp_torchrl.identification.parts import (
     ActuatorEstimate,
     ActuatorTrial,
@@ -15,4 +17,4 @@ from phihp_torchrl.identification.parts import (
 )
 from phihp_torchrl.identification.result import Identification
 
-__all__ = ["Identification"]
+__all__ = ["Identification", "IdentifyConfig", "identify"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -45,16 +44,15 @@ class Model:
         """How many parameters are those of constants."""
         return len(self.prior.learned)
 
-    def first(self, values: Mapping[str, float] | None = None) -> Tensor:
-        """Parameters of the first guesses; ``values`` are those of fitted parts."""
-        values = {name: getattr(self.path, name) for name in self.fitted} | dict(values or {})
-        parts = [_to_raw(name, values[name]) for name in self.fitted]
+    def first(self) -> Tensor:
+        """Parameters of the first guesses."""
+        parts = [_to_raw(name, getattr(self.path, name)) for name in self.fitted]
         raw = self.prior.log_constants.detach().double()
         return torch.cat([raw, torch.tensor(parts, dtype=raw.dtype)])
 
-    def with_parts(self, fitted: tuple[str, ...], path: Actuator | None = None) -> Model:
-        """The same equations behind another actuator."""
-        return replace(self, fitted=fitted, path=path or self.path)
+    def with_part(self, name: str, value: float) -> Model:
+        """The same equations, with one more part of the actuator fitted, from a first guess."""
+        return replace(self, fitted=(*self.fitted, name), path=replace(self.path, **{name: value}))
 
     def actuator(self, raw: Tensor) -> Actuator:
         """The actuator that belongs to parameters ``[p]``."""
@@ -97,7 +95,14 @@ class Model:
         return self.integrator(derivative, state, time, self.layout)  # type: ignore[arg-type]
 
     def slopes(
-        self, raw: Tensor, state: Tensor, acting: Tensor, seconds: Tensor, scale: Tensor
+        self,
+        raw: Tensor,
+        state: Tensor,
+        acting: Tensor,
+        seconds: Tensor,
+        scale: Tensor,
+        *,
+        learn: bool = True,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Derivatives of :meth:`step`, by central differences, all directions at once.
 
@@ -110,6 +115,7 @@ class Model:
             acting: ``[M, m]``.
             seconds: ``[M]``.
             scale: usual sizes of states and actions, ``[n + m]``.
+            learn: ``False`` for the derivatives by the state alone; the others are empty.
 
         Returns:
             By the state ``[M, n, n]``, by the action ``[M, n, m]``, by the parameters of the
@@ -117,13 +123,16 @@ class Model:
         """
         n, m, c = state.shape[-1], acting.shape[-1], self.constants
         size = _NUDGE * torch.cat([scale, torch.ones(c, dtype=scale.dtype)])
-        nudges = torch.cat([size.diag(), -size.diag()])[:, None, :]  # [2 d, 1, d]
-        states = state + nudges[..., :n]
-        actions = acting + nudges[..., n : n + m]
-        constants = (raw[:c] + nudges[..., n + m :]).expand(-1, len(state), -1)
-        ahead = self.step(constants, states, actions, seconds.expand(len(nudges), -1))
+        tried = len(size) if learn else n
+        nudges = torch.cat([size.diag()[:tried], -size.diag()[:tried]])[:, None, :]  # [2 d, 1, -]
+        constants = raw[:c]
+        if learn:
+            constants = (constants + nudges[..., n + m :]).expand(-1, len(state), -1)
+            acting = acting + nudges[..., n : n + m]
+        seconds = seconds.expand(len(nudges), -1)
+        ahead = self.step(constants, state + nudges[..., :n], acting, seconds)
         high, low = ahead.chunk(2)
-        slopes = ((high - low) / (2.0 * size[:, None, None])).permute(1, 2, 0)
+        slopes = ((high - low) / (2.0 * size[:tried, None, None])).permute(1, 2, 0)
         return slopes[..., :n], slopes[..., n : n + m], slopes[..., n + m :]
 
 

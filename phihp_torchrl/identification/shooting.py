@@ -74,10 +74,18 @@ class Shooting:
         model: the equations.
         samples: the recordings.
         windows: stretches of them.
+        teaching: which windows the parameters are fitted to, bool ``[W]``; by default all. The
+            starts of the others are fitted too, so that they tell how well the parameters serve
+            elsewhere.
     """
 
-    def __init__(self, model: Model, samples: Samples, windows: Windows) -> None:
+    def __init__(
+        self, model: Model, samples: Samples, windows: Windows, teaching: Tensor | None = None
+    ) -> None:
         self.model, self.samples, self.windows = model, samples, windows
+        self.teaching = torch.ones(len(windows.time), dtype=torch.bool)
+        if teaching is not None:
+            self.teaching = teaching
         self.guess = model.first()
         spread = samples.state.nan_to_num().std(0)
         self.scale = torch.cat([spread.clamp_min(1e-3), samples.action.std(0).clamp_min(1e-3)])
@@ -100,10 +108,8 @@ class Shooting:
             count += 1
             blocks = self._blocks(raw, states, residual, sigma, learn)
             for _ in range(10):
-                change, shift = _solve(blocks, damping)
-                if not learn:
-                    change = torch.zeros_like(raw)
-                trial = raw + change.clamp(-1.5, 1.5), starts + shift
+                change, shift = _solve(blocks, damping, self.teaching)
+                trial = raw + change, starts + shift
                 found = self._evaluate(*trial, sigma)
                 if found[2] < cost:
                     break
@@ -115,14 +121,27 @@ class Shooting:
             damping = max(damping / 8.0, 1e-10)
             if done:
                 break
-        information, scores = self._information(raw, states, residual, sigma)
-        return Fit(
-            raw, starts, states, residual * sigma, sigma, cost, information, scores, count
-        )
+        information, scores = raw.new_zeros(0, 0), raw.new_zeros(0, 0)
+        if learn:
+            information, scores = self._information(raw, states, residual, sigma)
+        return Fit(raw, starts, states, residual * sigma, sigma, cost, information, scores, count)
 
-    def _evaluate(
-        self, raw: Tensor, starts: Tensor, sigma: Tensor
-    ) -> tuple[Tensor, Tensor, float]:
+    def information(self, raw: Tensor, starts: Tensor, sigma: Tensor) -> Tensor:
+        """What the windows would tell of the parameters, were they measured as they are simulated.
+
+        Args:
+            raw: parameters ``[p]``.
+            starts: ``[W, n]``.
+            sigma: noise of each state; those that are NaN throughout are not measured.
+        """
+        acting = self.model.acting(self.samples, raw)[self.windows.index]
+        states = simulate(self.model, raw, starts, acting, self.windows)
+        measured = self.windows._replace(mask=self.windows.mask | ~self.samples.state.isnan()[:1])
+        other = Shooting(self.model, self.samples, measured)
+        other.scale = self.scale
+        return other._information(raw, states, torch.zeros_like(states), sigma)[0]
+
+    def _evaluate(self, raw: Tensor, starts: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, float]:
         """Trajectories, residuals in units of the standard deviations, and the cost."""
         windows = self.windows
         acting = self.model.acting(self.samples, raw)[windows.index]
@@ -130,7 +149,7 @@ class Shooting:
         error = (states - windows.measured) / sigma
         residual = torch.where(windows.mask, error, torch.zeros_like(error))
         believed = ((raw - self.guess) / _SPREAD).square().sum()
-        value = float(robust(residual).sum() + believed)
+        value = float(robust(residual[self.teaching]).sum() + believed)
         return states, residual, value if value == value else float("inf")
 
     def _sensitivities(self, raw: Tensor, states: Tensor, learn: bool) -> tuple[Tensor, Tensor]:
@@ -142,15 +161,17 @@ class Shooting:
         windows, model = self.windows, self.model
         count, length, size = states.shape
         acting = model.acting(self.samples, raw)[windows.index]
-        flat = (x[:, :-1].flatten(0, 1) for x in (states, acting))
+        flat = [x[:, :-1].flatten(0, 1) for x in (states, acting)]
         by_state, by_action, by_constant = model.slopes(
-            raw, *flat, windows.interval.flatten(), self.scale
+            raw, flat[0], flat[1], windows.interval.flatten(), self.scale, learn=learn
         )
-        paths = model.acting_slopes(self.samples, raw)[windows.index][:, :-1].flatten(0, 1)
-        by_raw = torch.cat([by_constant, by_action @ paths], -1)
+        by_raw = by_constant
+        if learn:
+            paths = model.acting_slopes(self.samples, raw)[windows.index][:, :-1].flatten(0, 1)
+            by_raw = torch.cat([by_constant, by_action @ paths], -1)
         steps = torch.cat([by_state, by_raw], -1).unflatten(0, (count, length - 1))
         rows = [torch.eye(size, dtype=states.dtype).expand(count, size, size)]
-        rows[0] = torch.cat([rows[0], states.new_zeros(count, size, len(raw))], -1)
+        rows[0] = torch.cat([rows[0], states.new_zeros(count, size, by_raw.shape[-1])], -1)
         for step in steps.unbind(1):
             ahead = step[..., :size] @ rows[-1]
             ahead[..., size:] += step[..., size:]
@@ -164,9 +185,7 @@ class Shooting:
         weight = (1.0 + (residual / KNEE).square()).rsqrt()
         blocks = self._weighted(raw, states, residual, sigma, weight, weight, learn)
         belief = torch.ones_like(raw) / _SPREAD**2
-        return blocks._replace(
-            belief=belief, pull=belief * (raw - self.guess)
-        )
+        return blocks._replace(belief=belief, pull=belief * (raw - self.guess))
 
     def _information(
         self, raw: Tensor, states: Tensor, residual: Tensor, sigma: Tensor
@@ -178,8 +197,9 @@ class Shooting:
         starts = _damped(blocks.starts, 1e-10)
         eliminated = torch.linalg.solve(starts, blocks.mixed.mT)
         pulled = torch.linalg.solve(starts, blocks.start_gradient[..., None])
-        information = (blocks.parameters - blocks.mixed @ eliminated).sum(0)
-        return information, blocks.gradient - (blocks.mixed @ pulled)[..., 0]
+        each = blocks.parameters - blocks.mixed @ eliminated
+        scores = blocks.gradient - (blocks.mixed @ pulled)[..., 0]
+        return each[self.teaching].sum(0), scores[self.teaching]
 
     def _weighted(
         self,
@@ -219,15 +239,19 @@ class _Blocks(NamedTuple):
     pull: Tensor
 
 
-def _solve(blocks: _Blocks, damping: float) -> tuple[Tensor, Tensor]:
+def _solve(blocks: _Blocks, damping: float, teaching: Tensor) -> tuple[Tensor, Tensor]:
     """A damped Gauss-Newton step of parameters ``[p]`` and starts ``[W, n]``."""
     starts = _damped(blocks.starts, damping)
     pulled = torch.linalg.solve(starts, blocks.start_gradient[..., None])
+    change = torch.zeros_like(blocks.belief)
+    if not blocks.gradient.shape[-1]:  # the starts alone
+        return change, -pulled[..., 0]
     eliminated = torch.linalg.solve(starts, blocks.mixed.mT)
-    full = _damped(blocks.parameters.sum(0), damping) + blocks.belief.diag()
-    matrix = full - (blocks.mixed @ eliminated).sum(0)
-    gradient = (blocks.gradient - (blocks.mixed @ pulled)[..., 0]).sum(0) + blocks.pull
-    change = -torch.linalg.solve(matrix, gradient)
+    full = _damped(blocks.parameters[teaching].sum(0), damping) + blocks.belief.diag()
+    matrix = full - (blocks.mixed @ eliminated)[teaching].sum(0)
+    gradient = (blocks.gradient - (blocks.mixed @ pulled)[..., 0])[teaching].sum(0) + blocks.pull
+    change = -torch.linalg.lstsq(matrix, gradient[:, None], driver="gelsd").solution[:, 0]
+    change = change.clamp(-1.5, 1.5)
     return change, -(pulled[..., 0] + (eliminated @ change[:, None])[..., 0])
 
 
@@ -243,7 +267,11 @@ def robust(residual: Tensor) -> Tensor:
 
 
 def settle(
-    shooting: Shooting, raw: Tensor, starts: Tensor, sigma: Tensor | None = None, rounds: int = 3,
+    shooting: Shooting,
+    raw: Tensor,
+    starts: Tensor,
+    sigma: Tensor | None = None,
+    rounds: int = 3,
     iterations: int = 15,
 ) -> Fit:
     """Fit, and estimate the noise from what remains, by turns.
@@ -259,8 +287,11 @@ def settle(
     if sigma is None:
         windows = shooting.windows
         sigma = noise(windows.measured - starts[:, None], windows.mask, 0)
-        sigma = noise(shooting.fit(sigma, raw, starts, iterations=3, learn=False).residual,
-                      windows.mask, starts.shape[1] * len(starts))
+        sigma = noise(
+            shooting.fit(sigma, raw, starts, iterations=3, learn=False).residual,
+            windows.mask,
+            starts.shape[1] * len(starts),
+        )
     for _ in range(rounds):
         fit = shooting.fit(sigma, raw, starts, iterations=iterations)
         raw, starts = fit.raw, fit.starts
