@@ -56,8 +56,10 @@ def uncertainty(fit: Fit, scale: Tensor) -> Uncertainty:
     information = fit.information / (scale[:, None] * scale)
     information = 0.5 * (information + information.mT)
     scores = fit.scores / scale
-    clusters = len(scores)
-    meat = scores.mT @ scores * (clusters / max(1, clusters - 1))
+    clusters, count = scores.shape
+    # Residuals are smaller than errors, for parameters and starts have been fitted to them.
+    used = count / clusters + fit.starts.shape[1] / max(_measurements(fit), 1.0)
+    meat = scores.mT @ scores / max(1.0 - used, 0.5)
     values, vectors = torch.linalg.eigh(information)
     values = values.clamp_min(1e-12)
     spread = (vectors * (meat @ vectors)).sum(0) / values.square()
@@ -67,6 +69,11 @@ def uncertainty(fit: Fit, scale: Tensor) -> Uncertainty:
     return Uncertainty(
         scale, vectors[:, ~closed].mT, bread @ meat @ bread, bread, _quantile(clusters - 1)
     )
+
+
+def _measurements(fit: Fit) -> float:
+    """Measurements in a window, on average."""
+    return float((fit.residual != 0).sum() / len(fit.residual))
 
 
 def _quantile(freedom: int) -> float:

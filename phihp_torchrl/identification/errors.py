@@ -15,8 +15,6 @@ from phihp_torchrl.identification.shooting import Shooting, simulate
 from phihp_torchrl.identification.windows import Samples, Windows, first_starts, make_windows
 from phihp_torchrl.recordings import Recording
 
-LEAST_PAST = 10
-"""Samples before a prediction that its start needs at least."""
 _STRIDE = 10
 """Samples from one prediction to the next."""
 
@@ -47,7 +45,7 @@ def predict(
     sigma: Tensor,
     held: Sequence[Span],
     inside: Sequence[Span],
-    past: int,
+    past: tuple[int, int],
     ahead: int,
 ) -> Predictions | None:
     """Predict ``ahead`` steps from places in held-out spans.
@@ -59,7 +57,7 @@ def predict(
         sigma: noise of each state.
         held: held-out spans.
         inside: the spans that hold them, in which a past may reach back.
-        past: samples of the past at most.
+        past: samples of the past, at least and at most.
         ahead: steps.
 
     Returns:
@@ -68,8 +66,8 @@ def predict(
     spans, origins = [], []
     for a, b in held:
         begin = next(x for x, y in inside if x <= a and b <= y)
-        for last in range(max(a - 1, begin + LEAST_PAST - 1), b - ahead, _STRIDE):
-            first = max(begin, last + 1 - past)
+        for last in range(max(a - 1, begin + past[0] - 1), b - ahead, _STRIDE):
+            first = max(begin, last + 1 - past[1])
             spans.append((first, last + ahead + 1))
             origins.append(last - first)
     if not spans:
