@@ -35,13 +35,14 @@ _HOMES = {
     "imagination": ("WorldModelEnv",),
     "planners": ("CEMPlanner", "MPPIPlanner", "register_planner"),
     "systems": ("Constant", "System"),
-    "tasks": ("Box", "Task", "get_task", "register_task"),
+    "tasks": ("Actuator", "Box", "Task", "get_task", "register_task"),
     "trainers": ("RunConfig", "RunResult", "register_phase", "run"),
     "worlds": ("Plant", "World", "make_world", "register_plant", "register_world"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Actuator",
     "Agent",
     "Box",
     "CEMPlanner",
@@ -102,10 +103,7 @@ if "phihp/Task-v0" not in gymnasium.registry:
 def __getattr__(name: str) -> Any:
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = _HOME_OF[name]
-    if home == "trainers":
-        import_module(f"{__name__}.tdmpc")  # it registers the phase of TD-MPC
-    value = getattr(import_module(f"{__name__}.{home}"), name)
+    value = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
     globals()[name] = value
     return value
 

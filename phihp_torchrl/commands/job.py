@@ -11,7 +11,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from torchrl.checkpoint import CheckpointError
 
-import phihp_torchrl.tdmpc  # noqa: F401  (it registers its phase)
 from phihp_torchrl.config import (
     MODULE,
     ConfigError,

@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import phihp_torchrl.tdmpc  # noqa: F401  (it registers its phase)
 from phihp_torchrl.commands.words import read_lines
 from phihp_torchrl.config import ConfigError, kind_mapping, load_config, override_lines
 from phihp_torchrl.deployment import Agent, load_agent
 from phihp_torchrl.tasks import Task, list_tasks, register_task
-from phihp_torchrl.trainers import RunDirectory, read_run_config, run
+from phihp_torchrl.trainers import RunDirectory, read_run_config, run, task_of
 from phihp_torchrl.worlds import WORLDS, GivenConfig, World, make_world
 
 
@@ -96,7 +95,8 @@ def learn(
         if world != "simulated":
             raise ConfigError("world", "expected it as an argument or in overrides, got both.")
         world = settings["world"]
-    reality = make_world(task, world)
+    given = read_run_config({**settings, "world": kind_mapping(GivenConfig())})
+    reality = make_world(task_of(given, task if isinstance(task, Task) else None), world)
     settings["world"] = _world_settings(reality)
     if run_dir is None:
         run_dir = settings.get("run_dir")

@@ -9,17 +9,16 @@ docstring. The files in ``config/settings`` that this writes are there to be rea
 
 from __future__ import annotations
 
-import re
 import textwrap
 from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 import phihp_torchrl.tdmpc  # noqa: F401  (it registers its phase)
-from phihp_torchrl.config import METHODS, YAML
+from phihp_torchrl.config import METHODS, YAML, default_of, sentences_of
 from phihp_torchrl.planners import PLANNERS
 from phihp_torchrl.trainers import PHASES, LoggerConfig, RunConfig
 from phihp_torchrl.worlds import WORLDS
@@ -59,20 +58,6 @@ def write() -> list[Path]:
     return written
 
 
-def sentences_of(cls: type) -> dict[str, str]:
-    """The sentence of each field in the ``Args`` of a dataclass and of those it extends."""
-    found: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        doc = base.__dict__.get("__doc__") or ""
-        section = re.search(r"^ *Args:\n(.*?)(?:\n *\n|\Z)", doc, re.S | re.M)
-        if section is None:
-            continue
-        for part in re.split(r"\n(?= {8}\w+: )", section[1]):
-            name, _, text = part.strip().partition(": ")
-            found[name] = _plain(text)
-    return found
-
-
 def _defaults() -> str:
     lines = [
         "# @package _global_",
@@ -110,23 +95,17 @@ def _section(
         key = f.metadata.get("key", f.name)
         if not f.init or f.name in leave_out:
             continue
-        value = (changed or {}).get(f.name, _default(f))
+        value = (changed or {}).get(f.name, default_of(f))
         sentence = words.get(f.name)
         if sentence is None:
             raise LookupError(f"{cls.__name__}.{f.name}: its docstring has no sentence for it.")
-        for line in textwrap.wrap(sentence, _WIDTH - 2 - len(indent)):
+        for line in textwrap.wrap(sentence.removesuffix("."), _WIDTH - 2 - len(indent)):
             yield f"{indent}# {line}"
         if is_dataclass(value):
             yield f"{indent}{key}:"
             yield from _section(type(value), depth + 1)
         else:
             yield f"{indent}{key}: {_text(value)}"
-
-
-def _default(f: Field) -> Any:
-    if f.default is not MISSING:
-        return f.default
-    return "???" if f.default_factory is MISSING else f.default_factory()
 
 
 def _text(value: Any) -> str:
@@ -136,12 +115,6 @@ def _text(value: Any) -> str:
         value = list(value)
     text = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True)
     return text.removesuffix("\n").removesuffix("\n...")
-
-
-def _plain(text: str) -> str:
-    """A sentence of a docstring without its markup and line breaks."""
-    text = re.sub(r":\w+:`~?([^`]*\.)?([^`]*)`", r"\2", " ".join(text.split()))
-    return text.replace("``", "").removesuffix(".")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, fields
@@ -11,7 +10,13 @@ from typing import Any, TypeVar
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
 
-from phihp_torchrl.config import ConfigError, from_mapping, override_key, parse_overrides
+from phihp_torchrl.config import (
+    ConfigError,
+    from_mapping,
+    override_key,
+    parse_overrides,
+    sentences_of,
+)
 
 T = TypeVar("T")
 
@@ -54,15 +59,13 @@ def read_lines(words: Sequence[str]) -> dict[str, Override]:
 
 def help_of(cls: type, usage: str) -> str:
     """Return the text of ``--help``: each setting with its default and a sentence."""
-    section = re.search(r"Args:\n(.*?)(?:\n *\n|\Z)", cls.__doc__ or "", re.S)
-    parts = re.split(r"\n(?= {8}\w+: )", section[1]) if section else []
-    words = {p.strip().split(": ", 1)[0]: " ".join(p.split(": ", 1)[1].split()) for p in parts}
+    words = sentences_of(cls)
     lines = [f"usage: {usage}", ""]
     for f in fields(cls):
         value = "..." if f.default is MISSING else f.default
         value = str(value).lower() if value is None or isinstance(value, bool) else value
         value = "null" if value == "none" else value
-        lines.append(f"  {f'{f.name}={value}':<28} {words.get(f.name, '').replace('``', '')}")
+        lines.append(f"  {f'{f.name}={value}':<28} {words.get(f.name, '')}")
     return "\n".join(lines)
 
 

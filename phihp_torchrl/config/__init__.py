@@ -29,10 +29,12 @@ from phihp_torchrl.config.compose import (
     parse_overrides,
 )
 from phihp_torchrl.config.errors import ConfigError
-from phihp_torchrl.config.help import help_text, sentences, settings_text
+from phihp_torchrl.config.help import help_text, sentences, sentences_of, settings_text
 from phihp_torchrl.config.methods import METHODS, Method, get_method, register_method
+from phihp_torchrl.config.modules import import_named
 from phihp_torchrl.config.registry import Registry
 from phihp_torchrl.config.typed import (
+    default_of,
     differences,
     flatten,
     from_mapping,

@@ -33,6 +33,8 @@ PLACES = ("run_dir", "resume")
 # The values of these are names of files, whose content is in the composed settings already.
 _GROUPS = ("preset", "task", "method", "budget", "logger", "world", "planner")
 _NAMES = ("task", "preset", "method")
+# Settings that are mappings with names of a user's choice, or that change something by name.
+_MAPPINGS = ("actuator", r"world\.actuator", r"world\.friction", r"world\.constants")
 _FIRST_PLANNER = "cem"  # the kind of planner that a layer's numbers are for if it names none
 
 
@@ -173,13 +175,14 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
 
 
 def open_mappings(words: Sequence[str]) -> list[str]:
-    """Prefix overrides that assign a mapping with ``++``, so that they may add keys to it.
+    """Prefix overrides that add keys to a mapping with ``++``, as Hydra wants them.
 
     Examples:
-        >>> open_mappings(["world.friction={joint:0.1}", "seed=0"])
-        ['++world.friction={joint:0.1}', 'seed=0']
+        >>> open_mappings(["world.friction={joint:0.1}", "actuator.lag=0.1", "seed=0"])
+        ['++world.friction={joint:0.1}', '++actuator.lag=0.1', 'seed=0']
     """
-    return [f"++{word}" if re.match(r"[\w.]+=\s*\{", word) else word for word in words]
+    adds = re.compile(rf"[\w.]+=\s*\{{|({'|'.join(_MAPPINGS)})\.\w+=")
+    return [f"++{word}" if adds.match(word) else word for word in words]
 
 
 def override_key(line: Override) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,6 +55,26 @@ def sentences(text: str) -> dict[str, str]:
             comment = []
         else:
             comment = []
+    return found
+
+
+def sentences_of(cls: type) -> dict[str, str]:
+    """The text of each field in the ``Args`` of a dataclass and its bases, without markup.
+
+    Examples:
+        >>> from phihp_torchrl.agents import TD3Config
+        >>> sentences_of(TD3Config)["gamma"]
+        'discount γ.'
+    """
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        doc = base.__dict__.get("__doc__") or ""
+        section = re.search(r"^ *Args:\n(.*?)(?:\n *\n|\Z)", doc, re.S | re.M)
+        if section is None:
+            continue
+        for part in re.split(r"\n(?= {8}\w+: )", section[1]):
+            name, _, text = part.strip().partition(": ")
+            found[name] = _without_markup(text)
     return found
 
 
@@ -115,6 +136,11 @@ def settings_text(overrides: Sequence[str], config_dir: str | Path | None = None
                 lines.append(f"{' ' * indent}# {sentence}")
         lines.append(line)
     return "\n".join(lines)
+
+
+def _without_markup(text: str) -> str:
+    text = re.sub(r":\w+:`~?([^`]*\.)?([^`]*)`", r"\2", " ".join(text.split()))
+    return text.replace("``", "")
 
 
 def _chosen(group: str, overrides: Sequence[str]) -> str | None:

@@ -129,6 +129,19 @@ def differences(ours: Any, theirs: Any, path: str = "") -> list[tuple[str, Any, 
     return [] if ours == theirs else [(path, ours, theirs)]
 
 
+def default_of(f: Field) -> Any:
+    """Return the default of a field of a dataclass, or ``"???"`` if it must be given.
+
+    Examples:
+        >>> from phihp_torchrl.worlds import TorchRLConfig
+        >>> {f.name: default_of(f) for f in fields(TorchRLConfig)}
+        {'make': '???', 'options': {}}
+    """
+    if f.default is not MISSING:
+        return f.default
+    return MISSING_VALUE if f.default_factory is MISSING else f.default_factory()
+
+
 def flatten(mapping: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     """Return the values of nested mappings by dotted key.
 

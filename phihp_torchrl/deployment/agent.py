@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from phihp_torchrl.agents import Actor, TwinQ
 from phihp_torchrl.config import ConfigError, kind_mapping, read_kind
+from phihp_torchrl.deployment.under_way import UnderWay
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.planners import PLANNERS, SamplingPlanner, SearchConfig, make_planner
 from phihp_torchrl.tasks import Task
@@ -91,6 +92,7 @@ class Agent(TensorDictModuleBase):
         self.qvalue = qvalue
         self.planner_config = planner_config
         self.metadata = dict(metadata or {})
+        self._memory = UnderWay(task) if task.register_count else None
         self.planner = None
         if use_planner and planner_config is not None:
             self.planner = self._make_planner(planner_config, compile)
@@ -109,22 +111,34 @@ class Agent(TensorDictModuleBase):
         """Write ``"action"`` ``[*batch, m]`` for ``"observation"`` ``[*batch, o]``; no gradients.
 
         Where the planner replans every few steps or starts warm, ``"is_init"`` tells it that an
-        episode starts (:class:`torchrl.envs.InitTracker`); without it, call :meth:`reset`.
+        episode starts (:class:`torchrl.envs.InitTracker`); without it, call :meth:`reset`. The same
+        holds for a task with an actuator, if the observation is the system's alone: the agent then
+        remembers the commands that are under way.
         """
         with torch.no_grad():
-            if self.planner is not None:
-                return self._plan(tensordict)
-            self._check(tensordict.get("observation", None), tensordict.batch_size)
-            return self.actor(tensordict)  # type: ignore[misc]  # one of the two is there
+            if self._memory is not None and self._memory.is_asked(tensordict):
+                seen = self._memory.extend(tensordict)
+                action = self._act(seen)["action"]
+                self._memory.record(action)
+                return tensordict.set("action", action)
+            return self._act(tensordict)
+
+    def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.planner is not None:
+            return self._plan(tensordict)
+        self._check(tensordict.get("observation", None), tensordict.batch_size)
+        return self.actor(tensordict)  # type: ignore[misc]  # one of the two is there
 
     def _plan(self, tensordict: TensorDictBase) -> TensorDictBase:
         assert self.planner is not None
         return self.planner(tensordict)
 
     def reset(self) -> None:
-        """Drop the previous plan, at the start of an episode."""
+        """Drop the previous plan and what is under way, at the start of an episode."""
         if self.planner is not None:
             self.planner.reset()
+        if self._memory is not None:
+            self._memory.reset()
 
     def actor_alone(self) -> Agent:
         """Return the same agent without planning, with the same modules."""
@@ -176,7 +190,8 @@ class Agent(TensorDictModuleBase):
                 )
             described[name] = config
         planner = self.planner_config
-        return {**described, "planner": None if planner is None else kind_mapping(planner)}
+        described["planner"] = None if planner is None else kind_mapping(planner)
+        return described
 
     @classmethod
     def build_modules(cls, task: Task, config: Mapping[str, Any]) -> dict[str, Any]:

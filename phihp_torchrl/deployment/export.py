@@ -55,7 +55,7 @@ class PlanModule(nn.Module):
             raise ConfigError("agent", "expected a model whose integrator compiles, got another.")
         self.planner = planner  # whose parameters are then this module's
         self.noise_shape = planner.settings.noise_shape((), agent.task.action_dim)
-        self._observation = agent.task.observe(agent.task.reset.sample([]))
+        self._observation = agent.task.observe(agent.task.sample_start([]))
 
     def forward(self, observation: Tensor, noise: Tensor) -> Tensor:
         """Return the first action of a plan, ``[m]``."""

@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import save as dump_tensors
 from torch import Tensor, nn
 
-from phihp_torchrl.config import ConfigError, Registry
+from phihp_torchrl.config import ConfigError, Registry, from_mapping
 from phihp_torchrl.deployment.agent import Agent
 from phihp_torchrl.deployment.formats import (
     BOUNDS_OF_VERSION_1,
@@ -27,7 +27,7 @@ from phihp_torchrl.deployment.formats import (
 )
 from phihp_torchrl.deployment.reading import MAX_JSON_BYTES, AgentError, read_json, read_weights
 from phihp_torchrl.origin import package_version
-from phihp_torchrl.tasks import Task, get_task
+from phihp_torchrl.tasks import Actuator, Task, get_task
 
 AGENT_FILE = "agent.json"
 WEIGHTS_FILE = "weights.safetensors"
@@ -104,6 +104,7 @@ def save_agent(
         "package_version": package_version(),
         "kind": agent.kind,
         "task": asdict(TaskSignature.of(agent.task)),
+        **({"actuator": actuator.config} if (actuator := agent.task.actuator) else {}),
         **config,
         "weights_sha256": hashlib.sha256(data).hexdigest(),
         "metadata": dict(agent.metadata if metadata is None else metadata),
@@ -176,6 +177,7 @@ def load_agent(
     except (ValueError, TypeError, AttributeError) as error:
         raise AgentError(f"{path}: {error}") from error
     task = _resolve_task(path, signature, task)
+    task = _with_actuator(path, task, content.get("actuator"))
     weights = _read_weights(directory / WEIGHTS_FILE, kind, task, content)
     device = _check_device(device)
     try:
@@ -251,6 +253,20 @@ def _resolve_task(path: Path, saved: TaskSignature, wanted: str | Task | None) -
                 f"{here!r}, got {there!r}."
             )
     return task
+
+
+def _with_actuator(path: Path, task: Task, numbers: Any) -> Task:
+    """The task with the actuator that the agent was trained for."""
+    try:
+        saved = None if numbers is None else from_mapping(Actuator, numbers, "actuator")
+    except (ConfigError, TypeError, AttributeError) as error:
+        raise AgentError(f"{path}: {error}") from error
+    if task.actuator not in (None, saved):
+        raise AgentError(
+            f"{path}: task {task.name!r} is another one here: expected its actuator "
+            f"{task.actuator}, got {saved}."
+        )
+    return task if task.actuator == saved else replace(task, actuator=saved)
 
 
 def _read_weights(

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld
 
@@ -97,8 +98,9 @@ def run_realtime(
             raise ConfigError(name, f"expected a positive number, got {value}.")
     period, ticks = 1.0 / rate, max(1, round(rate * seconds))
     task = find_task(task)
-    world = SimulatedWorld(replace(task, time_step=period)).model()
-    state = task.reset.sample([], generator=torch.Generator().manual_seed(seed))
+    timed = replace(task, time_step=period)
+    world = TaskWorldModel(timed, SimulatedWorld(timed).oracle())
+    state = task.sample_start([], torch.Generator().manual_seed(seed))
     action = task.bounds.center
     milliseconds, missed, total, tick = [], 0, 0.0, 0
     start = clock()

@@ -170,7 +170,7 @@ class HybridDynamics(nn.Module):
         return self.step(state, self.task.clip_action(action))
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
-        """The next state for an action in bounds, as :meth:`Task.transition` needs it."""
+        """The next state for what acts on the system, as :meth:`Task.transition` needs it."""
         return self.integrator(
             lambda s: self.derivative(s, action), state, self.task.time_step, self.task.layout
         )
@@ -198,14 +198,14 @@ class HybridDynamics(nn.Module):
 
         Args:
             state: first state, ``[*batch, n]``.
-            actions: the actions, ``[*batch, time, m]``; they are clipped to their bounds.
+            actions: what acts on the system in each step, ``[*batch, time, m]``.
 
         Returns:
             States after each action, ``[*batch, time, n]``.
         """
         states = []
         for action in actions.unbind(-2):
-            state = self(state, action)
+            state = self.step(state, action)
             states.append(state)
         return torch.stack(states, -2)
 

@@ -77,8 +77,8 @@ class DynamicsLoss(LossModule):
         check_positive(self, "lambda_0")
         check_not_negative(self, "tau_ph")
         self.register_buffer("lambda_", torch.tensor(float(lambda_0)))
-        self.register_buffer("error_scale", torch.ones(dynamics.task.state_dim))
-        self.register_buffer("residual_scale", torch.ones(dynamics.task.state_dim))
+        self.register_buffer("error_scale", torch.ones(dynamics.task.system.state_dim))
+        self.register_buffer("residual_scale", torch.ones(dynamics.task.system.state_dim))
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -109,11 +109,16 @@ class DynamicsLoss(LossModule):
         )
 
     def transitions(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        """Return state, action and next state of the transitions in a tensordict."""
-        locate, keys = self.dynamics.task.locate, self.tensor_keys
-        next_observation = tensordict.get("next").get(keys.observation)
-        state = locate(tensordict.get(keys.observation))
-        return state, tensordict.get(keys.action), locate(next_observation)
+        """Return state, action and next state of the transitions in a tensordict.
+
+        The states are those of the system, and the action is what acts on it: the command in
+        bounds, behind the task's actuator if it has one.
+        """
+        task, keys = self.dynamics.task, self.tensor_keys
+        following = tensordict.get("next").get(keys.observation)
+        state, registers = task.split(task.locate(tensordict.get(keys.observation)))
+        action, _ = task.acting(registers, tensordict.get(keys.action))
+        return state, action, task.split(task.locate(following))[0]
 
     def terms(
         self,
@@ -139,7 +144,7 @@ class DynamicsLoss(LossModule):
 
     def prediction_error(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
         """``s' - ŝ'`` ``[*batch, n]``, with differences of angles in [-pi, pi)."""
-        return self.dynamics.task.difference(next_state, self.dynamics(state, action))
+        return self.dynamics.task.difference(next_state, self.dynamics.step(state, action))
 
     @torch.no_grad()
     def update_lambda(self, loss_prediction: Tensor) -> None:

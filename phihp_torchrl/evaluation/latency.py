@@ -83,7 +83,7 @@ def measure_latency(
     task = find_task(task)
     generator = torch.Generator().manual_seed(seed)
     states = (task.coverage or task.reset).sample([warmup + calls], generator=generator)
-    observations = task.observe(states).to(device)
+    observations = task.observe(task.at_rest(states)).to(device)
     cuda = [observations.device] if observations.is_cuda else []
     milliseconds = []
     with torch.random.fork_rng(devices=cuda), torch.no_grad():

@@ -154,7 +154,7 @@ def _play_model(
     An actor alone is four times as fast on the world's tensors as in the TorchRL environment.
     """
     task, generator = world.task, torch.Generator().manual_seed(seed)
-    state = task.reset.sample([episodes], generator=generator).to(device)
+    state = task.sample_start([episodes], generator).to(device)
     tally = _Tally(episodes, device)
     for step in range(task.max_steps):
         tensordict = TensorDict(

@@ -1,4 +1,4 @@
-"""Which parts of the recordings take no part in the fit: blocks, from every region of the states."""
+"""Which samples take no part in the fit: blocks of them, from every region of the states."""
 
 from __future__ import annotations
 

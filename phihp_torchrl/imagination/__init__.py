@@ -18,6 +18,7 @@ from phihp_torchrl.imagination.start_states import (
     MixtureStates,
     StartConfig,
     StartStates,
+    TaskStates,
     make_start_states,
 )
 from phihp_torchrl.imagination.transitions import Batch, Transit, finite_transition
@@ -31,6 +32,7 @@ __all__ = [
     "Rollouts",
     "StartConfig",
     "StartStates",
+    "TaskStates",
     "WorldModelEnv",
     "make_start_states",
 ]

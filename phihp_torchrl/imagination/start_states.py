@@ -62,6 +62,49 @@ class BoxStates:
         return states.to(device)
 
 
+class TaskStates:
+    """Start states of a task whose physical components come from another sampler.
+
+    Behind them stand the registers of the task's actuator, if it has one.
+
+    Args:
+        task: the task.
+        physical: draws the physical components.
+        under_way: whether random commands are under way, for states in the middle of an episode;
+            otherwise nothing is.
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> from phihp_torchrl import get_task
+        >>> from phihp_torchrl.tasks import Actuator
+        >>> task = replace(get_task("pendulum"), actuator=Actuator(delay_steps=2.0))
+        >>> TaskStates(task, BoxStates(task.coverage), under_way=True).sample([5]).shape
+        torch.Size([5, 4])
+    """
+
+    def __init__(self, task: Task, physical: StartStates, *, under_way: bool) -> None:
+        self.task = task
+        self.physical = physical
+        self.under_way = under_way
+
+    def sample(
+        self,
+        shape: Sequence[int],
+        generator: torch.Generator | None = None,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        states = self.physical.sample(shape, generator, device)
+        actuator, bounds = self.task.actuator, self.task.bounds
+        if actuator is None:
+            return states
+        if not self.under_way:
+            return self.task.at_rest(states)
+        size = [*shape, actuator.places(self.task.action_dim), self.task.action_dim]
+        unit = torch.rand(size, generator=generator, device=_draw_device(generator)).mul(2).sub(1)
+        registers = actuator.random(bounds.to(unit.device).from_unit(unit))
+        return torch.cat([states, registers.to(states)], -1)
+
+
 class DataStates:
     """Start states drawn with replacement from the states of real data.
 
@@ -202,7 +245,9 @@ def make_start_states(
         )
     boxes = {"reset": task.reset, "coverage": task.coverage, "goal": task.goal}
     samplers: dict[str, StartStates] = {
-        k: BoxStates(box) for k, box in boxes.items() if box is not None
+        k: TaskStates(task, BoxStates(box), under_way=k != "reset")
+        for k, box in boxes.items()
+        if box is not None
     }
     if states is not None:
         samplers["data"] = states if isinstance(states, DataStates) else DataStates(states)

@@ -13,7 +13,7 @@ from torchrl.envs.model_based import ModelBasedEnvBase
 from torchrl.envs.model_based import WorldModelEnv as StockWorldModelEnv
 
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.imagination.start_states import BoxStates, StartStates
+from phihp_torchrl.imagination.start_states import BoxStates, StartStates, TaskStates
 
 
 class WorldModelEnv(StockWorldModelEnv):
@@ -86,7 +86,9 @@ class WorldModelEnv(StockWorldModelEnv):
         # The base class unlocks every env, which then drops rows of a batch that has a size.
         self._batch_locked = len(self.batch_size) > 0
         self.start_states = (
-            BoxStates(world_model.task.reset) if start_states is None else start_states
+            TaskStates(world_model.task, BoxStates(world_model.task.reset), under_way=False)
+            if start_states is None
+            else start_states
         )
         self.generator = torch.Generator()  # on the CPU: a seed means the same on every device
         self._set_seed(seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from phihp_torchrl.config import ConfigError, Registry
+from phihp_torchrl.config import ConfigError, Registry, check_choice, check_count
 from phihp_torchrl.integrators.base import Derivative, FixedStepIntegrator, Integrator, StateLayout
 from phihp_torchrl.integrators.dopri5 import Dopri5
 from phihp_torchrl.integrators.rk4 import RK4
@@ -40,3 +40,40 @@ def make_integrator(integrator: str | Integrator, **settings: Any) -> Integrator
         return INTEGRATORS.find(integrator)(**settings)
     except TypeError as error:
         raise ConfigError("integrator", f"{integrator!r} has no such settings: {error}") from error
+
+
+def check_integrator(config: Any) -> None:
+    """Refuse settings whose fields ``integrator`` and ``substeps`` name no integrator.
+
+    Raises:
+        ConfigError: for an unknown integrator, a number of substeps that is not positive, and
+            several substeps of an integrator that chooses its steps.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> check_integrator(SimpleNamespace(integrator="dopri5", substeps=2))
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: substeps: expected 1 for dopri5, got 2.
+    """
+    check_choice(config, "integrator", INTEGRATORS)
+    check_count(config, "substeps")
+    if config.substeps > 1 and not has_substeps(config.integrator):
+        raise ConfigError("substeps", f"expected 1 for {config.integrator}, got {config.substeps}.")
+
+
+def integrator_of(config: Any) -> Integrator:
+    """Return the integrator that the fields ``integrator`` and ``substeps`` of settings name.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> integrator_of(SimpleNamespace(integrator="rk4", substeps=4)).settings
+        {'substeps': 4}
+    """
+    settings = {"substeps": config.substeps} if config.substeps > 1 else {}
+    return make_integrator(config.integrator, **settings)
+
+
+def has_substeps(integrator: str) -> bool:
+    """Whether the integrator of that name takes as many steps as it is told."""
+    return issubclass(INTEGRATORS[integrator], FixedStepIntegrator)

@@ -9,4 +9,13 @@ from phihp_torchrl.tasks.bounds import ActionBounds
 from phihp_torchrl.tasks.box import Box
 from phihp_torchrl.tasks.registry import find_task, get_task, list_tasks, register_task
 
-__all__ = ["ActionBounds", "Box", "Task", "Transition", "get_task", "list_tasks", "register_task"]
+__all__ = [
+    "ActionBounds",
+    "Actuator",
+    "Box",
+    "Task",
+    "Transition",
+    "get_task",
+    "list_tasks",
+    "register_task",
+]

@@ -36,7 +36,7 @@ class Actuator:
     Args:
         delay_steps: dead time in steps; a fraction acts during a part of the step.
         lag: time constant τ in seconds; 0 for none.
-        slew: the largest rate in units of the action per second; ``inf`` for no limit.
+        slew: the largest rate in units of the action per second; ``None`` for no limit.
         dead_zone: commands up to this size, around zero, have no effect; larger ones lose it.
         gain_low: gain of negative commands, where that of positive ones is 1.
 
@@ -55,26 +55,25 @@ class Actuator:
 
     delay_steps: Numbers = 0.0
     lag: Numbers = 0.0
-    slew: Numbers = math.inf
+    slew: Numbers | None = None
     dead_zone: Numbers = 0.0
     gain_low: Numbers = 1.0
 
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            numbers = tuple(value) if isinstance(value, (tuple, list)) else (value,)
-            least = 0.0
-            for number in numbers:
-                valid = isinstance(number, (int, float)) and number >= least
-                positive = f.name in ("slew", "gain_low")
-                if not valid or (positive and number == 0) or not _limited(f.name, number):
-                    expected = "above 0" if positive else "of at least 0"
-                    raise ConfigError(
-                        f"actuator.{f.name}", f"expected numbers {expected}, got {value!r}."
-                    )
+            if f.name == "slew" and value is None:
+                continue
             listed = isinstance(value, (tuple, list))
-            kept = tuple(map(float, numbers)) if listed else float(numbers[0])
-            object.__setattr__(self, f.name, kept)
+            numbers = tuple(value) if listed else (value,)
+            positive = f.name in ("slew", "gain_low")
+            for number in numbers:
+                known = isinstance(number, (int, float)) and math.isfinite(number)
+                if not known or number < 0 or (positive and number == 0):
+                    expected = "above 0" if positive else "of at least 0"
+                    raise ConfigError(f.name, f"expected numbers {expected}, got {value!r}.")
+            kept = tuple(map(float, numbers))
+            object.__setattr__(self, f.name, kept if listed else kept[0])
 
     def check(self, actions: Sequence[str]) -> None:
         """Refuse numbers that are not one for all actions or one for each.
@@ -102,7 +101,7 @@ class Actuator:
     def _sizes(self, count: int) -> tuple[int, list[int], list[int]]:
         """Rows of the queue, and the actions that slew and that lag."""
         depth = max(math.ceil(d) for d in self._each("delay_steps", count))
-        slewing = [i for i, rate in enumerate(self._each("slew", count)) if math.isfinite(rate)]
+        slewing = [] if self.slew is None else list(range(count))
         lagging = [i for i, lag in enumerate(self._each("lag", count)) if lag > 0]
         return depth, slewing, lagging
 
@@ -161,22 +160,42 @@ class Actuator:
         lags = registers[..., depth * count + len(slewing) :].unbind(-1)
         lagged = dict(zip(lagging, lags, strict=True))
         after = torch.cat([*rows[1:], command], -1) if depth else queue
-        acting, slewed, last = [], [], []
+        acting: list[Tensor] = []
+        slewed, last = [], []
         for i in range(count):
             parts = self._segments(i, count, waited)
-            means: Tensor | float = 0.0
+            mean = torch.zeros_like(command[..., 0])
             for share, value in parts:
                 seconds = share * time_step
                 if i in slews:
                     value, slews[i] = _slew(slews[i], value, self._each("slew", count)[i], seconds)
                 if i in lagged:
                     value, lagged[i] = _lag(lagged[i], value, self._each("lag", count)[i], seconds)
-                means = means + share * value
-            acting.append(means)
+                mean = mean + share * value
+            acting.append(mean)
             slewed += [slews[i]] if i in slews else []
             last += [lagged[i]] if i in lagged else []
         following = [after, *(x.unsqueeze(-1) for x in [*slewed, *last])]
         return torch.stack(acting, -1), torch.cat(following, -1)
+
+    def along(self, commands: Tensor, intervals: float | Tensor) -> tuple[Tensor, Tensor]:
+        """Follow the commands of an episode, which starts with nothing under way.
+
+        Args:
+            commands: the commands in bounds, ``[T, m]``.
+            intervals: seconds for which each is held, a number or ``[T]``.
+
+        Returns:
+            The mean action over each step, ``[T, m]``, and the registers before it, ``[T, r]``.
+        """
+        seconds = torch.as_tensor(intervals, dtype=commands.dtype).expand(len(commands))
+        registers = self.rest(torch.zeros_like(commands[0]))
+        acting, before = [], []
+        for command, duration in zip(commands, seconds, strict=True):
+            before.append(registers)
+            action, registers = self.step(registers, command, duration)
+            acting.append(action)
+        return torch.stack(acting), torch.stack(before)
 
     def _segments(self, i: int, count: int, waited: list[Tensor]) -> list[tuple[float, Tensor]]:
         """The shares of a step, in order, and the shaped command that arrives during each."""
@@ -197,10 +216,6 @@ class Actuator:
                 value = value - value.clamp(-zone, zone)
             columns.append(value if gain == 1.0 else torch.where(value < 0, gain * value, value))
         return torch.stack(columns, -1)
-
-
-def _limited(name: str, value: float) -> bool:
-    return math.isfinite(value) or name == "slew"
 
 
 def _slew(

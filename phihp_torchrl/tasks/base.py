@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_count, check_positive
+from phihp_torchrl.config import ConfigError, check_count, check_positive, from_mapping
 from phihp_torchrl.integrators import StateLayout
 from phihp_torchrl.systems import System
+from phihp_torchrl.tasks.actuator import Actuator
 from phihp_torchrl.tasks.bounds import ActionBounds
 from phihp_torchrl.tasks.box import Box
 
@@ -21,7 +22,7 @@ RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 TerminatedFn = Callable[[Tensor], Tensor]
 """``next_state [*batch, n] -> bool [*batch]``."""
 Step = Callable[[Tensor, Tensor], Tensor]
-"""``state [*batch, n], action [*batch, m] -> next_state [*batch, n]``; the action is in bounds."""
+"""``state, action [*batch, m] -> next_state``, of the system's components, for what acts on it."""
 
 
 class Transition(NamedTuple):
@@ -71,6 +72,9 @@ class Task:
         exploration_reward: reward that data collection plans for, where ``reward`` is too sparse to
             make the system move. Defaults to ``reward``.
         action_low: lower bound of each action. Defaults to the negative of ``action_high``.
+        actuator: what happens to a command before it acts, such as dead time and lag. Commands that
+            are under way then belong to the state, as registers behind the physical components;
+            reward, end and dynamics see the physical components alone.
 
     Raises:
         ConfigError: for a field whose length or range does not fit the system; the message names
@@ -100,6 +104,7 @@ class Task:
     goal: Box | None = None
     exploration_reward: RewardFn | None = None
     action_low: tuple[float, ...] | None = None
+    actuator: Actuator | None = None
 
     layout: StateLayout = field(init=False, repr=False, compare=False)
     """Positions, velocities and their limits, for integrators."""
@@ -110,12 +115,14 @@ class Task:
         check_count(self, "max_steps")
         for name in ("reset", "coverage", "goal"):
             box = getattr(self, name)
-            if box is not None and len(box.low) != self.state_dim:
+            if box is not None and len(box.low) != self.system.state_dim:
                 raise ConfigError(
                     name,
-                    f"expected {self.state_dim} values for {self.system.state_names}, "
+                    f"expected {self.system.state_dim} values for {self.system.state_names}, "
                     f"got {len(box.low)}.",
                 )
+        if self.actuator is not None:
+            self.actuator.check(self.system.action_names)
         object.__setattr__(self, "velocity_limits", dict(self.velocity_limits))
         object.__setattr__(self, "layout", self.system.layout(self.velocity_limits))
 
@@ -147,9 +154,14 @@ class Task:
     # Sizes and maps of states, observations and actions, for everything that uses a task.
 
     @property
+    def register_count(self) -> int:
+        """Number of registers, ``r``: what is under way between commands and their effect."""
+        return 0 if self.actuator is None else self.actuator.registers(self.action_dim)
+
+    @property
     def state_dim(self) -> int:
-        """Number of state components, ``n``."""
-        return self.system.state_dim
+        """Number of state components, ``n``: those of the system, and then the registers."""
+        return self.system.state_dim + self.register_count
 
     @property
     def action_dim(self) -> int:
@@ -158,8 +170,8 @@ class Task:
 
     @property
     def observation_dim(self) -> int:
-        """Number of observation components, ``o``."""
-        return self.system.observation_dim
+        """Number of observation components, ``o``: those of the system, and the registers."""
+        return self.system.observation_dim + self.register_count
 
     @property
     def bounds(self) -> ActionBounds:
@@ -167,15 +179,74 @@ class Task:
         return ActionBounds.from_limits(self.action_low or (), self.action_high)
 
     def observe(self, state: Tensor) -> Tensor:
-        """State ``[*batch, n]`` -> observation ``[*batch, o]``."""
-        return self.system.observe(state)
+        """State ``[*batch, n]`` -> observation ``[*batch, o]``; registers in half-ranges."""
+        if not self.register_count:
+            return self.system.observe(state)
+        physical, registers = self.split(state)
+        center, scale = self._register_scales(state)
+        return torch.cat([self.system.observe(physical), (registers - center) / scale], -1)
 
     def locate(self, observation: Tensor) -> Tensor:
         """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""
-        return self.system.locate(observation)
+        if not self.register_count:
+            return self.system.locate(observation)
+        size = self.system.observation_dim
+        center, scale = self._register_scales(observation)
+        registers = center + scale * observation[..., size:]
+        return torch.cat([self.system.locate(observation[..., :size]), registers], -1)
+
+    def _register_scales(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        assert self.actuator is not None
+        bounds = self.bounds
+        scales = self.actuator.scales(bounds.center.to(like), bounds.scale.to(like))
+        return scales[0], scales[1]
+
+    # The registers of a task with an actuator; without one, states are physical as they are.
+
+    def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Split a state ``[*batch, n]`` into its physical components and its registers."""
+        size = self.system.state_dim
+        return state[..., :size], state[..., size:]
+
+    def with_actuator(self, numbers: Mapping[str, Any]) -> Task:
+        """Return the task with other numbers of its actuator, by name; none change nothing.
+
+        Raises:
+            ConfigError: for a number that an :class:`Actuator` does not have, or out of range.
+        """
+        if not numbers:
+            return self
+        ours = {} if self.actuator is None else self.actuator.config
+        return replace(self, actuator=from_mapping(Actuator, {**ours, **numbers}, "actuator"))
+
+    def at_rest(self, physical: Tensor) -> Tensor:
+        """The state ``[*batch, n]`` of physical components with nothing under way."""
+        if not self.register_count:
+            return physical
+        assert self.actuator is not None
+        still = torch.zeros_like(physical[..., :1]).expand(*physical.shape[:-1], self.action_dim)
+        return torch.cat([physical, self.actuator.rest(self.clip_action(still))], -1)
+
+    def sample_start(
+        self, shape: torch.Size | list[int], generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Draw states ``[*shape, n]`` in which episodes start, with nothing under way."""
+        return self.at_rest(self.reset.sample(shape, generator=generator))
+
+    def acting(self, registers: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what acts on the system during a step, and the registers after it.
+
+        Args:
+            registers: the registers before the step, ``[*batch, r]``.
+            action: the command of the step, ``[*batch, m]``; it is clipped to its bounds.
+        """
+        action = self.clip_action(action)
+        if self.actuator is None:
+            return action, registers
+        return self.actuator.step(registers, action, self.time_step)
 
     def difference(self, state: Tensor, other: Tensor) -> Tensor:
-        """``state - other`` ``[*batch, n]``, with differences of angles in [-pi, pi)."""
+        """``state - other``, with differences of angles in [-pi, pi); registers may be left out."""
         return self.system.difference(state, other)
 
     # One step of the task.
@@ -183,11 +254,11 @@ class Task:
     def transition(self, step: Step, state: Tensor, action: Tensor) -> Transition:
         """Take one step of the task, in which ``step`` (of a world or a model) moves the state.
 
-        This is the only place where an action is clipped, the state is moved, the reward is
-        computed and the termination is decided.
+        This is the only place where an action is clipped, what is under way moves on, the state is
+        moved, the reward is computed and the termination is decided.
 
         Args:
-            step: ``(state, action in bounds) -> next state``.
+            step: ``(physical state, action) -> next physical state``.
             state: the state before the step, ``[*batch, n]``.
             action: the action, in physical units, ``[*batch, m]``; it is clipped to its bounds.
 
@@ -195,9 +266,14 @@ class Task:
             The next state, the reward and whether the episode has terminated.
         """
         action = self.clip_action(action)
-        next_state = step(state, action)
-        reward = self.reward(state, action, next_state)
-        return Transition(next_state, reward, self.is_terminated(next_state))
+        if self.actuator is None:
+            next_state = moved = step(state, action)
+        else:
+            state, registers = self.split(state)
+            acting, registers = self.actuator.step(registers, action, self.time_step)
+            moved = step(state, acting)
+            next_state = torch.cat([moved, registers], -1)
+        return Transition(next_state, self.reward(state, action, moved), self.is_terminated(moved))
 
     def clip_action(self, action: Tensor) -> Tensor:
         """Clip an action ``[*batch, m]`` to its bounds."""
@@ -208,4 +284,4 @@ class Task:
         """Whether ``next_state`` ``[*batch, n]`` ends the episode, bool ``[*batch]``."""
         if self.terminated is None:
             return torch.zeros(next_state.shape[:-1], dtype=torch.bool, device=next_state.device)
-        return self.terminated(next_state)
+        return self.terminated(self.split(next_state)[0])

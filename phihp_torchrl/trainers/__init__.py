@@ -18,6 +18,7 @@ from phihp_torchrl.trainers.run_config import (
     check_run,
     read_request,
     read_run_config,
+    task_of,
 )
 from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
 from phihp_torchrl.trainers.td3 import RealTD3Config, RealTD3Trainer

@@ -32,7 +32,7 @@ from phihp_torchrl.dynamics import (
     split,
 )
 from phihp_torchrl.imagination import Batch
-from phihp_torchrl.integrators import INTEGRATORS, FixedStepIntegrator, Integrator, make_integrator
+from phihp_torchrl.integrators import check_integrator, has_substeps, integrator_of
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.collect import CollectConfig, planning_policy, random_policy
 from phihp_torchrl.trainers.context import Context
@@ -100,10 +100,10 @@ class ModelConfig:
         check_count(self, "real_steps", least=0 if self.kind == "oracle" else 1)
         if self.steps_per_iteration is not None:
             check_count(self, "steps_per_iteration")
-        check_count(self, "refit_steps", "substeps")
+        check_count(self, "refit_steps")
         check_choice(self, "residual_outputs", RESIDUAL_OUTPUTS)
         check_choice(self, "activation", _ACTIVATIONS)
-        check_choice(self, "integrator", INTEGRATORS)
+        check_integrator(self)
         check_widths(self, "hidden_sizes")
         check_positive(self, "lambda_0")
         check_not_negative(self, "tau_ph")
@@ -112,10 +112,8 @@ class ModelConfig:
                 "constants_error",
                 f"expected a relative error in [0, 1), got {self.constants_error}.",
             )
-        fixed = issubclass(INTEGRATORS[self.integrator], FixedStepIntegrator)
-        if self.substeps > 1 and not fixed:
-            raise ConfigError("substeps", f"expected 1 for {self.integrator}, got {self.substeps}.")
-        if self.kind != "oracle" and self.fit.method != "adam" and not fixed:
+        chooses = not has_substeps(self.integrator)
+        if self.kind != "oracle" and self.fit.method != "adam" and chooses:
             raise ConfigError(
                 "fit.method",
                 f"expected 'adam' for a model that is integrated by {self.integrator}, which "
@@ -155,8 +153,7 @@ def make_dynamics(
                 "model.kind", f"expected another than 'oracle': {world} has no truth to plan with."
             )
         return world.oracle()
-    settings = {"substeps": config.substeps} if config.substeps > 1 else {}
-    integrator: Integrator = make_integrator(config.integrator, **settings)
+    integrator = integrator_of(config)
     activation, sizes = _ACTIVATIONS[config.activation], config.hidden_sizes
     if config.kind == "data_driven":
         return HybridDynamics.data_driven(
@@ -253,7 +250,9 @@ class ModelTrainer:
             state = torch.zeros(0, self.task.state_dim)
             action = torch.zeros(0, self.task.action_dim)
             return Batch(state, action, torch.zeros(0), state, torch.zeros(0, dtype=torch.bool))
-        state, action, next_state = self.loss.transitions(self.data)
+        state = self.task.locate(self.data["observation"])
+        next_state = self.task.locate(self.data["next", "observation"])
+        action = self.data["action"]
         # "done" in the data includes truncations, which are not terminations.
         terminated = self.task.is_terminated(next_state)
         return Batch(state, action, self.data["next", "reward"][:, 0], next_state, terminated)

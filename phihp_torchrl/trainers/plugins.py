@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, import_named
 
 
 def import_plugins(plugins: Sequence[str]) -> None:
@@ -27,9 +25,7 @@ def import_plugins(plugins: Sequence[str]) -> None:
             if name.endswith(".py"):
                 _import_file(Path(name))
             else:
-                if (here := os.getcwd()) not in sys.path:
-                    sys.path.insert(0, here)
-                importlib.import_module(name)
+                import_named(name)
         # A user's file may raise anything; the message should name it and the reason.
         except Exception as error:
             raise ConfigError(

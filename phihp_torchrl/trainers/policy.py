@@ -200,14 +200,12 @@ class PolicyTrainer(TD3Trainer):
         self.worlds = self._new_worlds()
         self.best = [layer.clone() for layer in (*self.update.actor, *self.update.critics)]
         self.best_return = -math.inf
-        self._evaluation_states = task.reset.sample(
-            [config.evaluation_episodes], generator=self.generator
-        )
+        self._evaluation_states = task.sample_start([config.evaluation_episodes], self.generator)
         truth = None if world is None else world.model()
         self._real = None if truth is None else Rollouts(truth, act, self.max_age, compile=compile)
         # The world's episodes have a generator of their own: the log has no part in the training.
-        self._world_states = task.reset.sample(
-            [config.real_evaluation_episodes], generator=torch.Generator().manual_seed(seed)
+        self._world_states = task.sample_start(
+            [config.real_evaluation_episodes], torch.Generator().manual_seed(seed)
         )
 
     @property

@@ -17,9 +17,10 @@ def read_result(path: Path) -> TaskResult | None:
         ConfigError: if there is no run in ``path``.
     """
     directory = RunDirectory(path)
+    config = directory.read_config()
     if not directory.evaluation.is_file():
         return None
-    results, config = json.loads(directory.evaluation.read_text()), directory.read_config()
+    results = json.loads(directory.evaluation.read_text())
     means = {name: (result["return_mean"],) for name, result in results.items()}
     samples = directory.read_metadata()["real_steps"]
     method = METHODS.get(config.get("method", "phihp"))

@@ -17,7 +17,6 @@ from tqdm.auto import tqdm
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.origin import describe_origin
-from phihp_torchrl.tasks import Task, get_task
 from phihp_torchrl.trainers.checkpoints import (
     clear_rotation,
     load_latest,
@@ -28,7 +27,7 @@ from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.interrupt import Interrupt
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
 from phihp_torchrl.trainers.phases import PHASES, Phase, real_steps
-from phihp_torchrl.trainers.run_config import RunConfig, check_run
+from phihp_torchrl.trainers.run_config import RunConfig, check_run, task_of
 from phihp_torchrl.trainers.run_directory import MetricsTable, RunDirectory
 from phihp_torchrl.trainers.start import check_same, start_directory
 from phihp_torchrl.worlds import World, make_world
@@ -108,7 +107,7 @@ def run(
     # Adam's moments of unused weights become denormal, and those are slow.
     torch.set_flush_denormal(True)
     if world is None:
-        world = make_world(_find_task(config), config.world)
+        world = make_world(task_of(config), config.world)
     check_run(config, world)
     if resume:
         if path is None:
@@ -274,15 +273,6 @@ class _Run:
         )
         self.directory.write_metadata(metadata)
         return table, logger
-
-
-def _find_task(config: RunConfig) -> Task:
-    try:
-        return get_task(config.task)
-    except ConfigError as error:
-        raise ConfigError(
-            error.key, f"{error.reason} A plugin may register more: plugins=[my_task.py]."
-        ) from error
 
 
 def _seed_everything(seed: int) -> None:

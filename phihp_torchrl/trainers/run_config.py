@@ -23,6 +23,7 @@ from phihp_torchrl.config import (
 )
 from phihp_torchrl.evaluation import check_training_seed
 from phihp_torchrl.planners import PLANNERS, CEMConfig, SearchConfig
+from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.trainers.loggers import LoggerConfig
 from phihp_torchrl.trainers.phases import PHASES, unknown_phases
 from phihp_torchrl.trainers.plugins import import_plugins
@@ -57,6 +58,8 @@ class RunConfig:
         compile: whether to compile TD3, imagination and the agent's plans (minutes the first time,
             seconds later).
         progress: whether to show progress bars on a terminal.
+        actuator: numbers of the task's actuator that differ, by name: delay_steps, lag, slew,
+            dead_zone, gain_low.
         world: the real world.
         planner: how the agent plans.
         logger: where metrics are logged, besides metrics.csv.
@@ -85,6 +88,7 @@ class RunConfig:
     threads: int = 1
     compile: bool = True
     progress: bool = True
+    actuator: Mapping[str, Any] = field(default_factory=dict, hash=False)
     world: Any = field(default_factory=SimulatedConfig, metadata={"kinds": WORLDS})
     planner: SearchConfig | None = field(default_factory=CEMConfig, metadata={"kinds": PLANNERS})
     logger: LoggerConfig = field(default_factory=LoggerConfig)
@@ -263,6 +267,31 @@ def read_run_config(settings: Mapping[str, Any], given: Sequence[str] = ()) -> R
     if "sections" in rest:
         raise ConfigError("sections", "unknown key; phases are set by their own names.")
     return from_mapping(RunConfig, {**rest, "sections": sections})
+
+
+def task_of(config: RunConfig, task: Task | None = None) -> Task:
+    """Return the task of a run, with the actuator that its settings give it.
+
+    Args:
+        config: settings of the run.
+        task: the task, if it is not the registered one of that name.
+
+    Raises:
+        ConfigError: for a task that is not registered, and for an actuator that does not fit it.
+
+    Examples:
+        >>> from phihp_torchrl import load_config
+        >>> settings = load_config("pendulum", overrides=["actuator.delay_steps=2"])
+        >>> task_of(read_run_config(settings)).state_dim  # two commands wait
+        4
+    """
+    try:
+        task = task or find_task(config.task)
+    except ConfigError as error:
+        raise ConfigError(
+            error.key, f"{error.reason} A plugin may register more: plugins=[my_task.py]."
+        ) from error
+    return task.with_actuator(config.actuator)
 
 
 def check_run(config: RunConfig, world: World) -> None:

@@ -159,11 +159,11 @@ class RealTD3Trainer(TD3Trainer):
         if transitions is not None:
             self.replay.extend(transitions)
         self.given = given
-        first = task.reset.sample([1], generator=self.generator)
+        first = task.sample_start([1], self.generator)
         self.worlds = Worlds(first, torch.zeros(1, dtype=torch.int64))
         # Evaluations have a generator of their own: the log has no part in the training.
-        self._evaluation_states = task.reset.sample(
-            [config.evaluation_episodes], generator=torch.Generator().manual_seed(seed)
+        self._evaluation_states = task.sample_start(
+            [config.evaluation_episodes], torch.Generator().manual_seed(seed)
         )
 
     @property
@@ -192,7 +192,7 @@ class RealTD3Trainer(TD3Trainer):
             warm = len(self.replay) >= config.random_steps
             self._act(
                 self.world,
-                self.task.reset.sample([config.round_steps, 1], generator=self.generator),
+                self.task.sample_start([config.round_steps, 1], self.generator),
                 noise=config.exploration_noise,
                 random_fraction=0.0 if warm else 1.0,
             )

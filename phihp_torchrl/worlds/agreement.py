@@ -39,7 +39,8 @@ def disagreements(task: Task, data: TensorDictBase) -> list[str]:
         >>> disagreements(task, data)[0][:67]
         'the world ended 1 of 4 steps after which the task says it goes on, '
     """
-    state, next_state = task.locate(data["observation"]), task.locate(data["next", "observation"])
+    state, _ = task.split(task.locate(data["observation"]))
+    next_state, _ = task.split(task.locate(data["next", "observation"]))
     ours = task.is_terminated(next_state)
     theirs = data["next", "terminated"].reshape(-1)
     found = []

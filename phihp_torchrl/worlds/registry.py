@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import gymnasium
 from torchrl.envs import EnvBase, GymWrapper
 
-from phihp_torchrl.config import ConfigError, Registry, offer, read_kind
+from phihp_torchrl.config import ConfigError, Registry, default_of, offer, read_kind
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.gymnasium import GymnasiumConfig, GymnasiumWorld
@@ -66,7 +66,7 @@ def register_world(
     """
     kind = WORLDS.register(name, WorldKind(config, build, about), replace=replace)
     # A field without a default must be given, which Hydra's ??? enforces.
-    node = {f.name: _default(f) for f in fields(config) if f.init}
+    node = {f.name: default_of(f) for f in fields(config) if f.init}
     offer("world", name, {"world": {"kind": name, **node}})
     return kind
 
@@ -81,7 +81,8 @@ def make_world(task: str | Task, world: Any = "simulated") -> World:
             one, or a :class:`World`.
 
     Raises:
-        ConfigError: for a kind that is not registered, or settings that it does not have.
+        ConfigError: for a kind that is not registered, settings that it does not have, or a
+            :class:`World` of another task.
 
     Examples:
         >>> str(make_world("pendulum", {"kind": "gymnasium", "id": "Pendulum-v1"}))
@@ -92,6 +93,10 @@ def make_world(task: str | Task, world: Any = "simulated") -> World:
     """
     task = find_task(task)
     if isinstance(world, World):
+        if world.task.name != task.name:
+            raise ConfigError(
+                "world", f"expected a world of task {task.name!r}, got one of {world.task.name!r}."
+            )
         return world
     if isinstance(world, str):
         WORLDS.find(world)
@@ -124,12 +129,6 @@ def _refuse(task: Task, config: GivenConfig) -> World:
         "world.kind",
         "this run was started from Python with a world of its own; pass that world again.",
     )
-
-
-def _default(f: Any) -> Any:
-    if f.default is not MISSING:
-        return f.default
-    return f.default_factory() if f.default_factory is not MISSING else "???"
 
 
 register_world(

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import os
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -22,9 +19,10 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, import_named
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds.base import World
+from phihp_torchrl.worlds.command_memory import command_memory
 
 
 @dataclass(frozen=True)
@@ -139,6 +137,8 @@ def fit_env(task: Task, env: EnvBase) -> EnvBase:
         transforms.append(DoubleToFloat(in_keys=doubles))
     if "step_count" not in env.observation_spec.keys():  # noqa: SIM118 (a spec, no dictionary)
         transforms.append(StepCounter(max_steps=task.max_steps))
+    if env.observation_spec["observation"].shape[-1] != task.observation_dim:
+        transforms += command_memory(task)
     return TransformedEnv(env, Compose(*transforms)) if transforms else env
 
 
@@ -149,11 +149,8 @@ def import_object(key: str, name: str) -> Any:
         ConfigError: with ``key`` as its key, if there is no such object or its import fails.
     """
     module, _, attribute = name.partition(":")
-    here = os.getcwd()
-    if here not in sys.path:
-        sys.path.insert(0, here)
     try:
-        return getattr(importlib.import_module(module), attribute)
+        return getattr(import_named(module), attribute)
     # A user's module may raise anything; the message should name it and the reason.
     except Exception as error:
         raise ConfigError(
@@ -172,11 +169,14 @@ def _check_observation(task: Task, env: EnvBase) -> None:
         for part in ([f"cos {name}", f"sin {name}"] if name in task.system.angles else [name])
     ]
     spec = env.observation_spec.get("observation", None)
-    expected = f"'observation' of shape [{task.observation_dim}] ({', '.join(names)})"
+    size = task.system.observation_dim
+    expected = f"'observation' of shape [{size}] ({', '.join(names)})"
     if spec is None:
         keys = [str(key) for key in env.observation_spec.keys(True, True)]
         raise ConfigError("world", f"expected {expected}, it has {keys}.")
-    if spec.shape != (task.observation_dim,) or not spec.dtype.is_floating_point:
+    # An environment that shows what is under way by itself is right too.
+    shapes = [(size,), (task.observation_dim,)]
+    if spec.shape not in shapes or not spec.dtype.is_floating_point:
         raise ConfigError(
             "world", f"expected {expected}, got {spec.dtype} of shape {list(spec.shape)}."
         )

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from hydra.core.config_store import ConfigStore
 
+import phihp_torchrl.tdmpc  # noqa: F401  (its phase stays registered)
 from phihp_torchrl.commands import main
 from phihp_torchrl.config import METHODS, choices
 from phihp_torchrl.planners import PLANNERS

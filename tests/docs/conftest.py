@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 import phihp_torchrl
+import phihp_torchrl.tdmpc  # its phase and agent stay registered
 from phihp_torchrl.commands import learn
 from phihp_torchrl.config import METHODS, override_lines
 from phihp_torchrl.config.choices import _OFFERED

@@ -8,24 +8,8 @@ from importlib import import_module
 import pytest
 
 from tests.docs.blocks import PAGES, ROOT
+from tests.test_architecture import FOLDERS
 
-FOLDERS = [
-    "config",
-    "integrators",
-    "systems",
-    "tasks",
-    "dynamics",
-    "imagination",
-    "agents",
-    "planners",
-    "worlds",
-    "deployment",
-    "evaluation",
-    "trainers",
-    "tdmpc",
-    "commands",
-]
-"""From the lowest to the highest."""
 GONE = (
     r"\bSPEC\b|/work/|phihp_torchrl\.envs|recipes/config|recipes/presets|PlanSettings|MPPISettings"
     r"|HybridDynamics\.oracle|default_friction|friction_constants|WorldPhysics|PlanMemory|env_id"

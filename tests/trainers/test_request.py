@@ -166,6 +166,11 @@ def test_a_run_without_an_evaluation_earned_nothing_yet(tmp_path: Path) -> None:
     assert read_result(tmp_path / "run") is None
 
 
+def test_where_there_is_no_run_nothing_was_earned(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="not the directory of a run"):
+        read_result(tmp_path)
+
+
 def test_what_was_earned_in_another_world_is_called_by_it(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("task: pendulum\nworld: {kind: gymnasium}\n")
     (tmp_path / "metadata.json").write_text('{"real_steps": 60}')

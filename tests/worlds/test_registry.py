@@ -76,6 +76,12 @@ def test_a_world_is_itself():
     assert make_world("pendulum", world) is world
 
 
+def test_a_world_of_another_task_is_refused():
+    message = "^world: expected a world of task 'acrobot', got one of 'pendulum'\\.$"
+    with pytest.raises(ConfigError, match=message):
+        make_world("acrobot", SimulatedWorld(PENDULUM))
+
+
 def test_settings_reach_the_world():
     world = make_world("pendulum", {"integrator": "rk4", "substeps": 3, "friction": {"joint": 0.1}})
     assert world.integrator.settings == {"substeps": 3}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, cast
 
 import gymnasium as gym
@@ -11,14 +12,15 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
 from phihp_torchrl.integrators import Integrator, make_integrator
-from phihp_torchrl.tasks import Task, find_task
+from phihp_torchrl.tasks import Actuator, Task, find_task
 from phihp_torchrl.worlds.simulated.plant import Plant, find_plant
 
 
 class TaskEnv(gym.Env[Any, Any]):
     """The simulated world of a task as a gymnasium environment.
 
-    Observations are ``task.observe(state)`` in float32, actions are in physical units and
+    Observations are those of the system, in float32, without what is under way in an actuator;
+    actions are in physical units and
     clipped to their bounds, the arithmetic is in float64. Episodes end where the task terminates
     them; ``gymnasium.make`` applies ``task.max_steps`` by a ``TimeLimit``. Subclasses for the
     paper's systems inherit rendering from gymnasium's environments.
@@ -27,6 +29,7 @@ class TaskEnv(gym.Env[Any, Any]):
         task: a :class:`~phihp_torchrl.tasks.Task` or the name of a registered one.
         integrator: name of the integrator, or an instance. Defaults to semi-implicit Euler.
         plant: true constants and friction. Defaults to the plant registered for the task's system.
+        actuator: what happens to a command before it acts. Defaults to the task's.
         render_mode: one of ``metadata["render_modes"]``, or ``None``.
 
     Raises:
@@ -47,10 +50,13 @@ class TaskEnv(gym.Env[Any, Any]):
         *,
         integrator: str | Integrator | None = None,
         plant: Plant | None = None,
+        actuator: Actuator | None = None,
         render_mode: str | None = None,
     ) -> None:
         super().__init__()  # in a subclass: what gymnasium's environment needs for drawing
         self.task = find_task(task)
+        if actuator is not None:
+            self.task = replace(self.task, actuator=actuator)
         self.plant = plant or find_plant(self.task.system)
         self.integrator = make_integrator(integrator or "semi_implicit_euler")
         modes = [None, *self.metadata["render_modes"]]
@@ -61,7 +67,7 @@ class TaskEnv(gym.Env[Any, Any]):
         self.observation_space = _observation_space(self.task)
         self.state = None
         self.last_action: NDArray[np.float64] | None = None
-        """The last action as it was applied, after clipping; ``None`` before the first step."""
+        """What acted in the last step, after clipping; ``None`` before the first step."""
 
     @property
     def state(self) -> NDArray[np.float64] | None:
@@ -84,6 +90,8 @@ class TaskEnv(gym.Env[Any, Any]):
             raise ValueError(f"options: unknown {unknown}, expected at most ['state'].")
         box = self.task.reset
         self.state = options.get("state", self.np_random.uniform(box.low, box.high))
+        state = self.task.at_rest(torch.from_numpy(self._state))
+        self._registers = self.task.split(state)[1]
         self.last_action = None
         if self.render_mode == "human":
             self.render()
@@ -97,10 +105,11 @@ class TaskEnv(gym.Env[Any, Any]):
             raise ResetNeeded("state: expected a call of reset() before step().")
         wanted = torch.from_numpy(self._checked_action(action))
         with torch.inference_mode():
-            state = torch.from_numpy(self._state)
+            state = torch.cat([torch.from_numpy(self._state), self._registers])
             next_state, reward, terminated = self.task.transition(self._move, state, wanted)
-            observation = self._observe(next_state)
-        self.state = next_state.numpy()
+            moved, self._registers = self.task.split(next_state)
+            observation = self._observe(moved)
+        self.state = moved.numpy()
         if self.render_mode == "human":
             self.render()
         return observation, float(reward), bool(terminated), False, {}
@@ -112,7 +121,7 @@ class TaskEnv(gym.Env[Any, Any]):
         )
 
     def _observe(self, state: torch.Tensor) -> NDArray[np.float32]:
-        return cast(NDArray[np.float32], self.task.observe(state).float().numpy())
+        return cast(NDArray[np.float32], self.task.system.observe(state).float().numpy())
 
     def _checked_state(self, value: ArrayLike) -> NDArray[np.float64]:
         names = self.task.system.state_names

@@ -8,7 +8,7 @@ import gymnasium as gym
 from gymnasium.wrappers import TimeLimit
 
 from phihp_torchrl.integrators import Integrator
-from phihp_torchrl.tasks import Task, find_task
+from phihp_torchrl.tasks import Actuator, Task, find_task
 from phihp_torchrl.worlds.simulated.env import TaskEnv
 from phihp_torchrl.worlds.simulated.plant import Plant
 from phihp_torchrl.worlds.simulated.rendering import env_class
@@ -44,7 +44,7 @@ def make_task_env(task: str | Task, **options: Any) -> TaskEnv:
 
     Args:
         task: a task or the name of a registered one.
-        options: ``integrator``, ``plant`` and ``render_mode`` of
+        options: ``integrator``, ``plant``, ``actuator`` and ``render_mode`` of
             :class:`~phihp_torchrl.worlds.TaskEnv`.
 
     Examples:
@@ -60,6 +60,7 @@ def make_limited_env(
     *,
     integrator: str | Integrator | None = None,
     plant: Plant | None = None,
+    actuator: Actuator | None = None,
     render_mode: str | None = None,
 ) -> gym.Env[Any, Any]:
     """Make the simulated world of a task, truncated after ``max_steps``, for ``phihp/Task-v0``.
@@ -68,6 +69,7 @@ def make_limited_env(
         task: a task or the name of a registered one.
         integrator: name of the integrator, or an instance.
         plant: true constants and friction.
+        actuator: what happens to a command before it acts. Defaults to the task's.
         render_mode: ``"human"`` or ``"rgb_array"`` if the task's system is one of the paper's.
 
     Examples:
@@ -76,5 +78,7 @@ def make_limited_env(
         'pendulum-swingup'
     """
     task = find_task(task)
-    env = make_task_env(task, integrator=integrator, plant=plant, render_mode=render_mode)
+    env = make_task_env(
+        task, integrator=integrator, plant=plant, actuator=actuator, render_mode=render_mode
+    )
     return TimeLimit(env, max_episode_steps=task.max_steps)

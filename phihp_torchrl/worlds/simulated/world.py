@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import gymnasium
@@ -12,12 +13,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, GymWrapper, RewardSum, StepCounter, TransformedEnv
 
-from phihp_torchrl.config import ConfigError, check_choice, check_count
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.imagination import WorldModelEnv
-from phihp_torchrl.integrators import INTEGRATORS, FixedStepIntegrator, Integrator, make_integrator
+from phihp_torchrl.integrators import check_integrator, integrator_of
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds.base import World
+from phihp_torchrl.worlds.command_memory import command_memory
 from phihp_torchrl.worlds.simulated.plant import Plant, PlantPhysics, find_plant
 
 
@@ -30,6 +32,7 @@ class SimulatedConfig:
         substeps: solver steps in a control step; 1 for dopri5, which chooses its steps.
         constants: true constants that differ from the system's first guesses, by name.
         friction: friction coefficients that differ from the plant's defaults, by name.
+        actuator: numbers in which the actuator of the world differs from the task's, by name.
 
     Raises:
         ConfigError: for an unknown integrator or a number of substeps that is not positive.
@@ -46,12 +49,10 @@ class SimulatedConfig:
     substeps: int = 1
     constants: Mapping[str, float] = field(default_factory=dict, hash=False)
     friction: Mapping[str, float] = field(default_factory=dict, hash=False)
+    actuator: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        check_choice(self, "integrator", INTEGRATORS)
-        check_count(self, "substeps")
-        if self.substeps > 1 and not issubclass(INTEGRATORS[self.integrator], FixedStepIntegrator):
-            raise ConfigError("substeps", f"expected 1 for {self.integrator}, got {self.substeps}.")
+        check_integrator(self)
 
 
 class SimulatedWorld(World):
@@ -83,8 +84,8 @@ class SimulatedWorld(World):
         except ConfigError as error:
             key = error.key.replace("coefficients", "friction", 1)  # as the settings call them
             raise ConfigError(f"world.{key}", error.reason) from error
-        settings = {"substeps": config.substeps} if config.substeps > 1 else {}
-        self.integrator: Integrator = make_integrator(config.integrator, **settings)
+        self.actuator = self.task.with_actuator(config.actuator).actuator
+        self.integrator = integrator_of(config)
 
     @property
     def truth(self) -> Plant:
@@ -96,13 +97,17 @@ class SimulatedWorld(World):
         physics = PlantPhysics(self._plant)
         return HybridDynamics(self.task, prior=physics, residual=None, integrator=self.integrator)
 
-    def model(self) -> TaskWorldModel:
-        """Return the world as an exact model, of any batch shape."""
-        return TaskWorldModel(self.task, self.oracle())
+    def model(self) -> TaskWorldModel | None:
+        """Return the world as an exact model, of any batch shape.
+
+        There is none where the world treats commands otherwise than the task says.
+        """
+        same = self.actuator == self.task.actuator
+        return TaskWorldModel(self.task, self.oracle()) if same else None
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
-        return self.oracle()(state, action)
+        return self._dynamics(state, action)
 
     def make_env(self, *, render: bool = False) -> EnvBase:
         env = gymnasium.make(
@@ -110,9 +115,10 @@ class SimulatedWorld(World):
             task=self.task,
             plant=self._plant,
             integrator=self.integrator,
+            actuator=self.actuator,
             render_mode="rgb_array" if render else None,
         )
-        return TransformedEnv(GymWrapper(env), StepCounter())
+        return TransformedEnv(GymWrapper(env), Compose(StepCounter(), *command_memory(self.task)))
 
     def picture(self, env: EnvBase) -> NDArray[Any] | None:
         return env.base_env._env.render()
@@ -137,5 +143,11 @@ class SimulatedWorld(World):
         Returns:
             The environment, in float32.
         """
-        env = WorldModelEnv(self.model(), batch_size=batch_size, device=device, seed=seed)
+        model = TaskWorldModel(replace(self.task, actuator=self.actuator), self.oracle())
+        env = WorldModelEnv(model, batch_size=batch_size, device=device, seed=seed)
         return TransformedEnv(env, Compose(StepCounter(max_steps=self.task.max_steps), RewardSum()))
+
+    @cached_property
+    def _dynamics(self) -> HybridDynamics:
+        # An oracle that nobody else has, so that nobody moves it to another device.
+        return self.oracle()
