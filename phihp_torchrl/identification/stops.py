@@ -16,9 +16,9 @@ Stops = dict[str, tuple[float, float]]
 
 _BAND = 5.0
 """Standard deviations of the noise within which a position counts as at the stop."""
-_PILE = 5.0
+_PILE = 3.0
 """How much denser samples lie at a stop than beside it."""
-_LEAST = 10
+_LEAST = 5
 """Samples at a stop, from which on there is one."""
 _VISITS = 3
 
