@@ -67,6 +67,8 @@ class HybridDynamics(nn.Module):
         self.prior = prior
         self.residual = residual
         self.integrator = make_integrator(integrator)
+        impulse = getattr(prior, "impulse", None)  # how a stop of one position acts on the others
+        self.layout = task.layout if impulse is None else task.layout.coupled(impulse)
 
     @classmethod
     def hybrid(
@@ -172,7 +174,7 @@ class HybridDynamics(nn.Module):
     def step(self, state: Tensor, action: Tensor) -> Tensor:
         """The next state for what acts on the system, as :meth:`Task.transition` needs it."""
         return self.integrator(
-            lambda s: self.derivative(s, action), state, self.task.time_step, self.task.layout
+            lambda s: self.derivative(s, action), state, self.task.time_step, self.layout
         )
 
     def derivative(self, state: Tensor, action: Tensor) -> Tensor:

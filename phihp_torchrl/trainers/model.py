@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -36,8 +37,16 @@ from phihp_torchrl.integrators import check_integrator, has_substeps, integrator
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.collect import CollectConfig, planning_policy, random_policy
 from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.exploration import Exploration
 from phihp_torchrl.trainers.phases import Phase, register_phase
-from phihp_torchrl.worlds import SimulatedWorld, World, disagreements, make_world
+from phihp_torchrl.worlds import (
+    SimulatedWorld,
+    World,
+    crossings_text,
+    disagreements,
+    guard_env,
+    make_world,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -215,7 +224,10 @@ class ModelTrainer:
         self.task = task
         self.config = config
         self.world = make_world(task, world)
-        self.env = self.world.make_env()
+        self.exploration = Exploration(task, config.collect.exploration)
+        self.crossings: Counter[str] = Counter()
+        guards = config.collect.exploration.guards
+        self.env = guard_env(self.world.make_env(), task, guards, self.crossings)
         self.generator = torch.Generator().manual_seed(seed)
         self.dynamics = make_dynamics(self.world, config, self.generator)
         self.initial = {k: v.clone() for k, v in self.dynamics.state_dict().items()}
@@ -269,6 +281,8 @@ class ModelTrainer:
         self.iteration += 1
         self._tell_disagreements()
         metrics = {"real_steps": self.real_steps, "collect/reward": new["next", "reward"].mean()}
+        if self.config.collect.exploration.guards:
+            metrics["collect/guard_crossings"] = self.crossings.total()
         if self.config.kind != "oracle":
             metrics |= self.fit()
         return {name: float(value) for name, value in metrics.items()}
@@ -277,16 +291,19 @@ class ModelTrainer:
         """Take real steps: at random in the first iteration, with the planner in later ones."""
         config, generator = self.config, self.generator
         if self.iteration == 0:
-            policy = random_policy(self.task, config.collect, generator)
+            policy = random_policy(self.task, config.collect, generator, self.exploration)
         else:
             fade = max(0.0, 1.0 - (self.iteration - 1) / max(1, config.iterations - 2))
+            noise = fade * config.collect.noise
             policy = planning_policy(
-                self.task, self.dynamics, config.collect, generator, fade * config.collect.noise
+                self.task, self.dynamics, config.collect, generator, noise, self.exploration
             )
         # Each iteration has its seed, so that a resumed run has the same resets.
         self.env.set_seed(self._draw_seed())
+        self.crossings.clear()
         with torch.no_grad():
             rollout = self.env.rollout(steps, policy, break_when_any_done=False)
+        self._tell_crossings(steps)
         done = rollout["next", "done"].clone()
         done[-1] = True  # the next rollout starts from a reset
         return TensorDict(
@@ -301,6 +318,18 @@ class ModelTrainer:
             ),
             batch_size=[steps],
         ).detach()
+
+    def _tell_crossings(self, steps: int) -> None:
+        """Warn where guards ended episodes."""
+        if self.crossings:
+            _log.warning(
+                "Guards ended %d episodes in %d real steps (%s). If the plant should not come near "
+                "them, lower model.collect.exploration.amplitude or rate, or explore around a "
+                "controller (model.collect.exploration.controller).",
+                self.crossings.total(),
+                steps,
+                crossings_text(self.crossings),
+            )
 
     def _tell_disagreements(self) -> None:
         """Warn where real transitions contradict the task, when first seen and at the end."""
