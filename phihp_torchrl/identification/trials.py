@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.identification.model import Model
-from phihp_torchrl.identification.shooting import Shooting, noise, robust
+from phihp_torchrl.identification.settling import noise
+from phihp_torchrl.identification.shooting import Shooting, robust
 from phihp_torchrl.identification.windows import Samples, Windows, first_starts
 
 WINDOWS = 160
