@@ -11,7 +11,12 @@ from torch import Tensor, nn
 from phihp_torchrl.config import ConfigError, Registry
 from phihp_torchrl.dynamics.prior import PhysicsPrior
 from phihp_torchrl.dynamics.residual import ResidualMLP
-from phihp_torchrl.integrators import Integrator, make_integrator
+from phihp_torchrl.integrators import (
+    Integrator,
+    integrator_mapping,
+    make_integrator,
+    read_integrator,
+)
 from phihp_torchrl.tasks import Task
 
 RESIDUAL_OUTPUTS = ("velocities", "all")
@@ -148,7 +153,7 @@ class HybridDynamics(nn.Module):
                 name: None if part is None else _config_of(name, part)
                 for name, part in parts.items()
             },
-            "integrator": {"name": self.integrator.name, **self.integrator.settings},
+            "integrator": integrator_mapping(self.integrator),
         }
 
     @classmethod
@@ -163,19 +168,24 @@ class HybridDynamics(nn.Module):
             prior = PRIORS.find(prior["kind"]).from_config(task.system, prior)
         if residual is not None:
             residual = ResidualMLP.from_config(task.system, residual)
-        integrator = dict(config["integrator"])
-        solver = make_integrator(integrator.pop("name"), **integrator)
+        solver = read_integrator(config["integrator"])
         return cls(task, prior=prior, residual=residual, integrator=solver)
 
-    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+    def forward(self, state: Tensor, action: Tensor, time_step: Tensor | None = None) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
-        return self.step(state, self.task.clip_action(action))
+        return self.step(state, self.task.clip_action(action), time_step)
 
-    def step(self, state: Tensor, action: Tensor) -> Tensor:
-        """The next state for what acts on the system, as :meth:`Task.transition` needs it."""
-        return self.integrator(
-            lambda s: self.derivative(s, action), state, self.task.time_step, self.layout
-        )
+    def step(self, state: Tensor, action: Tensor, time_step: Tensor | None = None) -> Tensor:
+        """The next state for what acts on the system, as :meth:`Task.transition` needs it.
+
+        Args:
+            state: states of the system ``[*batch, n]``.
+            action: what acts on it, ``[*batch, m]``.
+            time_step: seconds for which each action is held, ``[*batch, 1]``. Defaults to the time
+                step of the task.
+        """
+        seconds = self.task.time_step if time_step is None else time_step
+        return self.integrator(lambda s: self.derivative(s, action), state, seconds, self.layout)
 
     def derivative(self, state: Tensor, action: Tensor) -> Tensor:
         """ds/dt = F^p + F^r, ``[*batch, n]``."""
@@ -195,19 +205,21 @@ class HybridDynamics(nn.Module):
         return residual / (prior + residual).clamp_min(torch.finfo(state.dtype).tiny)
 
     @torch.no_grad()
-    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+    def rollout(self, state: Tensor, actions: Tensor, time_step: Tensor | None = None) -> Tensor:
         """Predict the states of a sequence of actions.
 
         Args:
             state: first state, ``[*batch, n]``.
             actions: what acts on the system in each step, ``[*batch, time, m]``.
+            time_step: seconds for which each is held, ``[*batch, time, 1]``. Defaults to the time
+                step of the task.
 
         Returns:
             States after each action, ``[*batch, time, n]``.
         """
         states = []
-        for action in actions.unbind(-2):
-            state = self.step(state, action)
+        for k, action in enumerate(actions.unbind(-2)):
+            state = self.step(state, action, None if time_step is None else time_step[..., k, :])
             states.append(state)
         return torch.stack(states, -2)
 
