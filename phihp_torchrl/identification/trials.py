@@ -92,9 +92,11 @@ class Trials:
         return float(total)
 
     def better(self, trial: Trial, best: Trial) -> bool:
-        """Whether windows are better by three standard errors of pairs, and by half a percent."""
+        """Whether windows are better by three standard errors (or all), and by half a percent."""
         sigma = self.noise(best)
         gain = self.losses(best, sigma) - self.losses(trial, sigma)
         error = gain.std() / len(gain) ** 0.5
         whole = self.losses(best, sigma).sum()
-        return bool((gain.mean() > _CLEAR * error) & (gain.sum() > _WORTH * whole))
+        clear = bool(gain.mean() > _CLEAR * error)
+        everywhere = bool((gain > 0).all()) and len(gain) >= 5  # few windows, but all of them
+        return (clear or everywhere) and bool(gain.sum() > _WORTH * whole)

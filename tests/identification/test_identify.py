@@ -227,7 +227,6 @@ def test_a_rig_that_was_simulated_by_eulers_steps_is_integrated_so() -> None:
     )
     for u in command:
         states.append(state)
-        layout = layout or truth.layout()
         state = solver(lambda s, u=u: truth.prior(s, u, truth.constants), state, 0.05, layout)
     log = Recording(0.05 * torch.arange(400), torch.stack(states), command)
     settings = {**PLAIN, "integrator": "auto", "substeps": 0}
