@@ -220,11 +220,8 @@ def test_recordings_that_do_not_fit_are_refused() -> None:
 def test_a_rig_that_was_simulated_by_eulers_steps_is_integrated_so() -> None:
     state, states = torch.tensor([0.3, 0.0]).double(), []
     command = (5.0 * torch.sin(torch.arange(400) ** 1.5 / 40.0)).double()[:, None]
-    truth, solver, layout = (
-        Mass().with_constants(MASS),
-        make_integrator("semi_implicit_euler"),
-        None,
-    )
+    truth, layout = Mass().with_constants(MASS), Mass().layout()
+    solver = make_integrator("semi_implicit_euler")
     for u in command:
         states.append(state)
         state = solver(lambda s, u=u: truth.prior(s, u, truth.constants), state, 0.05, layout)
