@@ -39,7 +39,7 @@ class FitConfig:
             fall by a tenth (multiple shooting: by a hundredth).
         window: steps in a trajectory of multiple shooting.
         shuffle_actions: whether the penalty on F^r of Levenberg-Marquardt pairs each state with the
-            action of another transition. A controller's actions are correlated with the velocities, so
+            action of another transition. The actions of a controller go with the velocities, so
             that the smallest F^r on the pairs as recorded would explain friction by a wrong effect
             of the action.
 
