@@ -41,7 +41,8 @@ def per_life(dynamics: HybridDynamics, shifts: Tensor | None = None) -> HybridDy
         >>> bool((first == again).all()), bool((first == second).all())
         (True, False)
     """
-    prior, residual = dynamics.prior, dynamics.residual
+    # A model of one's own kind, without these parts, is the same in all rows.
+    prior, residual = (getattr(dynamics, part, None) for part in ("prior", "residual"))
     if isinstance(residual, EnsembleResidual) and residual.members > 1:
         residual = _RowResidual(residual)
     if shifts is not None:
@@ -54,7 +55,7 @@ def per_life(dynamics: HybridDynamics, shifts: Tensor | None = None) -> HybridDy
                 f"got {list(shifts.shape)}.",
             )
         prior = _RowPrior(prior, shifts)
-    if prior is dynamics.prior and residual is dynamics.residual:
+    if not isinstance(prior, _RowPrior) and not isinstance(residual, _RowResidual):
         return dynamics
     return HybridDynamics(
         dynamics.task, prior=prior, residual=residual, integrator=dynamics.integrator

@@ -379,7 +379,7 @@ def _draw(
     """Shifts of the constants of each imagined world, ``[worlds, learned]``, if there are any."""
     if not config.draw_constants:
         return None
-    prior = dynamics.prior
+    prior = getattr(dynamics, "prior", None)
     if not isinstance(prior, PhysicsPrior) or not prior.learned:
         raise ConfigError(
             "policy.draw_constants", "expected false for a model without learned constants."
