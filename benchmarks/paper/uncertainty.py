@@ -13,6 +13,7 @@ Settings are chosen with seeds below 100 (and --results elsewhere), and reported
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import tempfile
 import time
@@ -70,7 +71,7 @@ def train(task: str, variant: str, seed: int, lines: Sequence[str]) -> dict[str,
         _, path = learn(task, overrides=lines, run_dir=Path(place, "run"))
         returns = json.loads((path / "evaluation.json").read_text())
         metadata = json.loads((path / "metadata.json").read_text())
-        metrics = _last_metrics(path / "metrics.csv")
+        rows = list(csv.DictReader((path / "metrics.csv").open()))
     return {
         "task": task,
         "variant": variant,
@@ -78,23 +79,35 @@ def train(task: str, variant: str, seed: int, lines: Sequence[str]) -> dict[str,
         "settings": list(lines),
         "real_steps": metadata["real_steps"],
         "returns": {name: result["returns"] for name, result in returns.items()},
-        "metrics": metrics,
+        "metrics": _last_metrics(rows),
+        "cost": cost(rows),
         "seconds": metadata["seconds"],
         "wall_seconds": round(time.monotonic() - begun, 1),
         "origin": describe_origin(seed),
     }
 
 
-def _last_metrics(path: Path) -> dict[str, float]:
+def _last_metrics(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
     """The last value of what the model and the policy say of themselves."""
-    lines = [line.split(",") for line in path.read_text().splitlines()]
     names = ("model/held_out_error", "model/rollout_error_20", "policy/best_imagined_return")
-    found = {}
-    for name in set(names) & set(lines[0]):
-        column = lines[0].index(name)
-        values = [line[column] for line in lines[1:] if line[column]]
-        found[name] = float(values[-1])
-    return found
+    values = {name: [row[name] for row in rows if row.get(name)] for name in names}
+    return {name: float(column[-1]) for name, column in values.items() if column}
+
+
+def cost(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
+    """Seconds of all fits, and of an update with its share of imagination and evaluation.
+
+    The latter is the median over evaluation intervals: the first, which compiles, does not count.
+    """
+    fits = sum(float(row["model/fit_seconds"]) for row in rows if row.get("model/fit_seconds"))
+    points = [
+        (float(row["policy/seconds"]), float(row["policy/updates"]))
+        for row in rows
+        if row.get("policy/seconds")
+    ]
+    pairs = zip(points[1:], points[:-1], strict=True)
+    each = [(after[0] - before[0]) / (after[1] - before[1]) for after, before in pairs]
+    return {"fits": fits, **({"update": float(np.median(each))} if each else {})}
 
 
 def interval(values: Sequence[float]) -> tuple[float, float]:
@@ -119,7 +132,6 @@ def gains(runs: Sequence[Mapping[str, Any]], player: str) -> list[list[str]]:
             means = {s: float(np.mean(run["returns"][player])) for s, run in mine.items()}
             plain = {s: by_key[task, PLAIN, s] for s in seeds if (task, PLAIN, s) in by_key}
             gain = [means[s] - float(np.mean(plain[s]["returns"][player])) for s in plain]
-            times = [_seconds(mine[s]) / _seconds(plain[s]) for s in plain]
             rows.append(
                 [
                     task,
@@ -129,15 +141,22 @@ def gains(runs: Sequence[Mapping[str, Any]], player: str) -> list[list[str]]:
                     str(_value_of(mine[seeds[0]], "policy.updates")),
                     _with_interval(*interval(list(means.values()))),
                     "" if variant == PLAIN or not gain else _with_interval(*interval(gain)),
-                    "" if variant == PLAIN or not times else f"{np.mean(times):.2f}",
+                    *(_times(mine, plain, part) for part in ("fits", "update")),
                 ]
             )
     return rows
 
 
-def _seconds(run: Mapping[str, Any]) -> float:
-    """Time of learning model and policy; playing the evaluation costs the same for all."""
-    return float(run["seconds"]["model"] + run["seconds"]["policy"])
+def _times(
+    mine: Mapping[int, Mapping[str, Any]], plain: Mapping[int, Mapping[str, Any]], part: str
+) -> str:
+    """How many times longer than plain a part takes: the median over seeds that recorded it."""
+    ratios = [
+        mine[s]["cost"][part] / plain[s]["cost"][part]
+        for s in plain
+        if mine[s] is not plain[s] and all(part in r.get("cost", {}) for r in (mine[s], plain[s]))
+    ]
+    return f"{np.median(ratios):.2f}" if ratios else ""
 
 
 def _value_of(run: Mapping[str, Any], key: str) -> str:
@@ -153,7 +172,7 @@ def write_tables(results: Path) -> None:
     """The tables of all runs so far."""
     runs = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
     header = ["task", "variant", "seeds", "real samples", "updates", "return"]
-    header += ["gain over plain", "times plain's seconds"]
+    header += ["gain over plain", "fits, × plain's time", "an update, × plain's time"]
     text = (
         "# Uncertainty in imagination\n\n"
         "Made by `python benchmarks/paper/uncertainty.py`. Do not edit. PhIHP with a tenth of the "
@@ -163,8 +182,8 @@ def write_tables(results: Path) -> None:
         + ".\n\nReturns are means over 50 evaluation episodes of a training seed, then over "
         "training seeds, ± half the 95 % interval over training seeds (Student's t). A gain is "
         "taken seed by seed, over the same episodes. An interval that holds 0 shows no gain. "
-        "Seconds are those of learning model and policy, compilation included, on a machine "
-        "shared with other work.\n"
+        "Times are wall clock on a machine shared with other work, medians over seeds, without "
+        "what compiling takes.\n"
     )
     for player, title in (("planner", "With the planner"), ("actor", "The actor alone")):
         text += f"\n## {title}\n\n{markdown_table(header, gains(runs, player))}"

@@ -9,7 +9,7 @@ import pytest
 
 from phihp_torchrl import load_config
 from phihp_torchrl.trainers import read_run_config
-from uncertainty import RESULTS, VARIANTS, gains, interval, settings, write_tables
+from uncertainty import RESULTS, VARIANTS, cost, gains, interval, settings, write_tables
 
 ORIGIN = {
     "commit": "5e6e490c0ffee",
@@ -27,6 +27,7 @@ def made(variant, seed, planner, seconds=10.0, task="pendulum-swingup"):
         "real_steps": 250,
         "returns": {"planner": planner, "actor": [value - 1.0 for value in planner]},
         "metrics": {},
+        "cost": {"fits": seconds, "update": 0.5 * seconds},
         "seconds": {"model": seconds, "policy": seconds, "evaluate": 99.0},
         "wall_seconds": 100.0,
         "origin": ORIGIN,
@@ -65,13 +66,20 @@ def test_a_gain_is_taken_seed_by_seed():
     ]
     plain, both = gains(runs, "planner")
     assert plain[:6] == ["pendulum-swingup", "plain", "2", "250", "100", "51.0 ± 635.3"]
-    assert plain[6:] == ["", ""]
-    assert both[6:] == ["3.0 ± 12.7", "3.00"]
+    assert plain[6:] == ["", "", ""]
+    assert both[6:] == ["3.0 ± 12.7", "3.00", "3.00"]
+
+
+def test_an_update_costs_what_it_does_once_all_is_compiled():
+    points = [(100.0, 10), (120.0, 20), (140.0, 30), (190.0, 40)]  # 10 s an update, then 2, 2, 5
+    rows = [{"model/fit_seconds": "1.5"}, {"model/fit_seconds": "2.5"}]
+    rows += [{"policy/seconds": str(t), "policy/updates": str(n)} for t, n in points]
+    assert cost(rows) == {"fits": 4.0, "update": 2.0}
 
 
 def test_a_variant_without_plain_runs_has_no_gain():
     (row,) = gains([made("both", 100, [1.0])], "planner")
-    assert row[5:] == ["1.0 one seed", "", ""]
+    assert row[5:] == ["1.0 one seed", "", "", ""]
 
 
 def test_the_tables_hold_what_the_files_hold(tmp_path):
@@ -81,7 +89,10 @@ def test_the_tables_hold_what_the_files_hold(tmp_path):
             (tmp_path / f"{variant}-{seed}.json").write_text(json.dumps(run))
     write_tables(tmp_path)
     text = (tmp_path / "README.md").read_text()
-    assert "| pendulum-swingup | ensemble | 2 | 250 | 100 | 1.5 ± 0.0 | 0.0 ± 0.0 | 1.00 |" in text
+    assert (
+        "| pendulum-swingup | ensemble | 2 | 250 | 100 | 1.5 ± 0.0 | 0.0 ± 0.0 | 1.00 | 1.00 |"
+        in text
+    )
     assert "Training seeds: 100, 101. Commits: 5e6e490." in text
     assert "both |" not in text
     assert "constants |" not in text
