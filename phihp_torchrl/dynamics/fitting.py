@@ -13,7 +13,10 @@ from torch import Tensor
 from torch.func import functional_call, jacrev, vmap
 
 from phihp_torchrl.config import ConfigError, check_choice, check_count, check_positive
+from phihp_torchrl.dynamics.ensemble import EnsembleResidual
 from phihp_torchrl.dynamics.loss import DynamicsLoss
+from phihp_torchrl.dynamics.members import member_loss
+from phihp_torchrl.dynamics.residual import ResidualMLP
 from phihp_torchrl.dynamics.shooting import multiple_shooting
 
 
@@ -81,7 +84,7 @@ class FitReport:
     Args:
         train_error: error on the transitions that were fitted.
         held_out_error: error on the held-out transitions.
-        steps: optimization steps that were taken.
+        steps: optimization steps that were taken, by all members of an ensemble together.
         seconds: duration of the fit.
     """
 
@@ -99,6 +102,10 @@ def fit(
     generator: torch.Generator | None = None,
 ) -> FitReport:
     """Fit ``loss.dynamics`` to transitions in place, starting from its current parameters.
+
+    The members of an :class:`EnsembleResidual` are fitted one after the other, each as if it were
+    alone: the first with the prior to all of ``train``, the others without it to draws of as many
+    transitions with replacement. The errors reported are those of their mean.
 
     Args:
         loss: the loss of the model; its λ and scales are changed as well.
@@ -146,13 +153,40 @@ def fit(
     start = time.perf_counter()
     if config.scaled:
         loss.set_scales(train)
-    steps = _METHODS[config.method](loss, train, held_out, config, generator)
+    if isinstance(loss.dynamics.residual, EnsembleResidual):
+        steps = _fit_members(loss, loss.dynamics.residual, train, held_out, config, generator)
+    else:
+        steps = _METHODS[config.method](loss, train, held_out, config, generator)
     return FitReport(
         train_error=_error(loss, train),
         held_out_error=_error(loss, held_out),
         steps=steps,
         seconds=time.perf_counter() - start,
     )
+
+
+def _fit_members(
+    loss: DynamicsLoss,
+    ensemble: EnsembleResidual,
+    train: TensorDictBase,
+    held_out: TensorDictBase,
+    config: FitConfig,
+    generator: torch.Generator | None,
+) -> int:
+    method = _adam if config.method == "adam" else _levenberg_marquardt
+    steps, count = 0, len(train)
+    for index in range(ensemble.members):
+        own = member_loss(loss, index)
+        drawn = train
+        if index > 0:
+            drawn = train[torch.randint(count, (count,), generator=generator)]
+        steps += method(own, drawn, held_out, config, generator)
+        fitted = own.dynamics.residual
+        assert isinstance(fitted, ResidualMLP)
+        ensemble.set_member(index, fitted)
+    with torch.no_grad():
+        loss.lambda_.copy_(own.lambda_)  # every member's has grown alike
+    return steps
 
 
 @torch.no_grad()

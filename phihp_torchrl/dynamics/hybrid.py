@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from phihp_torchrl.config import ConfigError, Registry
+from phihp_torchrl.dynamics.ensemble import EnsembleResidual
 from phihp_torchrl.dynamics.prior import PhysicsPrior
 from phihp_torchrl.dynamics.residual import ResidualMLP
 from phihp_torchrl.integrators import (
@@ -17,6 +18,7 @@ from phihp_torchrl.integrators import (
     make_integrator,
     read_integrator,
 )
+from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import Task
 
 RESIDUAL_OUTPUTS = ("velocities", "all")
@@ -85,6 +87,7 @@ class HybridDynamics(nn.Module):
         activation: type[nn.Module] = nn.Tanh,
         residual_outputs: str = "velocities",
         integrator: str | Integrator = "semi_implicit_euler",
+        ensemble: int = 1,
     ) -> HybridDynamics:
         """Build the model of the paper: a prior with learned constants, and a residual network.
 
@@ -97,9 +100,11 @@ class HybridDynamics(nn.Module):
                 position is its velocity by definition), ``"all"`` every component of ds/dt, as
                 published.
             integrator: name of an integrator, or an instance.
+            ensemble: number of residual networks (:class:`EnsembleResidual`); 1 for a single one.
 
         Raises:
-            ConfigError: for an unknown ``residual_outputs``, integrator or constant.
+            ConfigError: for an unknown ``residual_outputs``, integrator or constant, and for an
+                ensemble of less than one.
         """
         if residual_outputs not in RESIDUAL_OUTPUTS:
             raise ConfigError(
@@ -111,7 +116,7 @@ class HybridDynamics(nn.Module):
         return cls(
             task,
             prior=PhysicsPrior(system, constants),
-            residual=ResidualMLP(system, hidden_sizes, outputs, activation),
+            residual=_residual(system, hidden_sizes, outputs, activation, ensemble),
             integrator=integrator,
         )
 
@@ -123,9 +128,10 @@ class HybridDynamics(nn.Module):
         hidden_sizes: Sequence[int] = (16, 16),
         activation: type[nn.Module] = nn.Tanh,
         integrator: str | Integrator = "semi_implicit_euler",
+        ensemble: int = 1,
     ) -> HybridDynamics:
         """Build the transition without F^p, the paper's data-driven model."""
-        residual = ResidualMLP(task.system, hidden_sizes, activation=activation)
+        residual = _residual(task.system, hidden_sizes, None, activation, ensemble)
         return cls(task, prior=None, residual=residual, integrator=integrator)
 
     @classmethod
@@ -167,7 +173,8 @@ class HybridDynamics(nn.Module):
         if prior is not None:
             prior = PRIORS.find(prior["kind"]).from_config(task.system, prior)
         if residual is not None:
-            residual = ResidualMLP.from_config(task.system, residual)
+            kind = EnsembleResidual if "members" in residual else ResidualMLP
+            residual = kind.from_config(task.system, residual)
         solver = read_integrator(config["integrator"])
         return cls(task, prior=prior, residual=residual, integrator=solver)
 
@@ -222,6 +229,18 @@ class HybridDynamics(nn.Module):
             state = self.step(state, action, None if time_step is None else time_step[..., k, :])
             states.append(state)
         return torch.stack(states, -2)
+
+
+def _residual(
+    system: System,
+    hidden_sizes: Sequence[int],
+    outputs: Sequence[int] | None,
+    activation: type[nn.Module],
+    ensemble: int,
+) -> ResidualMLP:
+    if ensemble == 1:
+        return ResidualMLP(system, hidden_sizes, outputs, activation)
+    return EnsembleResidual(system, ensemble, hidden_sizes, outputs, activation)
 
 
 def _config_of(name: str, part: nn.Module) -> dict[str, Any]:

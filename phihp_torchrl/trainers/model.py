@@ -30,6 +30,7 @@ from phihp_torchrl.dynamics import (
     FitReport,
     HybridDynamics,
     PhysicsPrior,
+    constants_covariance,
     fit,
     fit_solver,
     perturbed_constants,
@@ -84,6 +85,8 @@ class ModelConfig:
         activation: activation of the residual: relu, tanh or silu.
         residual_outputs: components that the residual corrects, velocities (accelerations only) or
             all (every component of ds/dt).
+        ensemble: number of residual networks; with more than one, each imagined life has one of
+            them and plans use their mean. The time of a fit is proportional to it.
         integrator: integrator of the model, semi_implicit_euler, rk4 or dopri5; or auto, for the
             cheapest one with fixed steps that predicts held-out transitions about as well as any.
         substeps: solver steps in a control step; 1 for dopri5 and auto, which choose their steps.
@@ -111,6 +114,7 @@ class ModelConfig:
     hidden_sizes: tuple[int, ...] = (16, 16)
     activation: str = "tanh"
     residual_outputs: str = "velocities"
+    ensemble: int = 1
     integrator: str = AUTO
     substeps: int = 1
     lambda_0: float = 1e3
@@ -125,7 +129,13 @@ class ModelConfig:
         check_count(self, "real_steps", least=0 if self.kind == "oracle" else 1)
         if self.steps_per_iteration is not None:
             check_count(self, "steps_per_iteration")
-        check_count(self, "refit_steps")
+        check_count(self, "refit_steps", "ensemble")
+        if self.ensemble > 1 and self.kind not in ("hybrid", "data_driven"):
+            raise ConfigError(
+                "ensemble",
+                f"expected 1 for a model of kind {self.kind!r}, which has no residual, "
+                f"got {self.ensemble}.",
+            )
         check_choice(self, "residual_outputs", RESIDUAL_OUTPUTS)
         check_choice(self, "activation", _ACTIVATIONS)
         if self.integrator != AUTO:
@@ -186,7 +196,11 @@ def make_dynamics(
     activation, sizes = _ACTIVATIONS[config.activation], config.hidden_sizes
     if config.kind == "data_driven":
         return HybridDynamics.data_driven(
-            task, hidden_sizes=sizes, activation=activation, integrator=integrator
+            task,
+            hidden_sizes=sizes,
+            activation=activation,
+            integrator=integrator,
+            ensemble=config.ensemble,
         )
     guess = _first_guess(world, config.constants_error, generator)
     if config.kind == "prior":
@@ -198,6 +212,7 @@ def make_dynamics(
         activation=activation,
         residual_outputs=config.residual_outputs,
         integrator=integrator,
+        ensemble=config.ensemble,
     )
 
 
@@ -306,6 +321,18 @@ class ModelTrainer:
         # "done" in the data includes truncations, which are not terminations.
         terminated = self.task.is_terminated(next_state)
         return Batch(state, action, self.data["next", "reward"][:, 0], next_state, terminated)
+
+    def constants_covariance(self) -> Tensor:
+        """Covariance of the prior's learned constants after the last fit, ``[learned, learned]``.
+
+        Raises:
+            ConfigError: before the first fit, and as
+                :func:`~phihp_torchrl.dynamics.constants_covariance`.
+        """
+        if self.data is None:
+            raise ConfigError("real_steps", "expected real steps that were fitted, got none.")
+        train, held_out, _ = split(self.data)
+        return constants_covariance(self.loss, train, held_out)
 
     def parts(self) -> dict[str, Any]:
         """Return the model, as an argument of :class:`~phihp_torchrl.Agent`."""
