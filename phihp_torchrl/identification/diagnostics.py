@@ -1,0 +1,227 @@
+"""What a reader must know before trusting a fit, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.identification.parts import (
+    AT_LIMIT,
+    COMBINED,
+    FIXED,
+    IDENTIFIED,
+    Estimate,
+    Finding,
+    HorizonError,
+    Residuals,
+)
+from phihp_torchrl.identification.shooting import Fit
+from phihp_torchrl.identification.windows import Samples, Windows
+from phihp_torchrl.systems import System
+
+BEFORE = 5
+"""How many previous commands are looked at."""
+_EXPLAINED = 0.1
+_WHITE = 0.3
+_JITTER = 0.02
+_OVER = 2.0
+
+
+def of_constants(constants: Mapping[str, Estimate]) -> list[Finding]:
+    """Constants that the data do not determine, and those at a limit."""
+    found = []
+    for name, c in constants.items():
+        if c.verdict == AT_LIMIT:
+            text = f"{name} is at its limit ({c.estimate:.4g})."
+            found.append(Finding("limit", text, c.advice))
+        elif c.verdict not in (IDENTIFIED, FIXED):
+            text = f"{name}: {c.verdict}."
+            found.append(
+                Finding("combination" if COMBINED in c.verdict else "unknown", text, c.advice)
+            )
+    return found
+
+
+def of_recordings(system: System, samples: Samples) -> list[Finding]:
+    """Clock, missing samples, commands that never change, velocities that are none."""
+    found = []
+    inside = samples.stretch[1:] == samples.stretch[:-1]
+    intervals = samples.interval[:-1][inside]
+    spread = float(intervals.std() / intervals.mean()) if len(intervals) > 1 else 0.0
+    if spread > _JITTER:
+        found.append(
+            Finding(
+                "clock",
+                f"The clock is irregular: intervals of {float(intervals.min()):.3g} to "
+                f"{float(intervals.max()):.3g} s, {100 * spread:.0f} % of the mean apart.",
+                "Each interval was integrated as it is; keep the stamps, and do not resample.",
+            )
+        )
+    same_episode = samples.first[1:] == samples.first[:-1]
+    gaps = int((~inside & same_episode).sum())
+    if gaps:
+        found.append(
+            Finding(
+                "gaps",
+                f"{gaps} gaps interrupt the episodes.",
+                "No window goes over a gap; for the actuator, the last command is held in it. Log "
+                "without losses if the path of the command matters.",
+            )
+        )
+    for i, name in enumerate(system.action_names):
+        if not float(samples.action[:, i].std()) > 0:
+            found.append(
+                Finding(
+                    "excitation",
+                    f"{name} never changes.",
+                    "Nothing can be learned of what it does; record a motion that uses it.",
+                )
+            )
+    return found + _velocities(system, samples)
+
+
+def _velocities(system: System, samples: Samples) -> list[Finding]:
+    """Velocities that are not the slope of their position, over ten samples."""
+    found = []
+    apart = min(10, len(samples.time) - 1)
+    same = samples.stretch[apart:] == samples.stretch[:-apart]
+    for position, velocity in system.velocity_of.items():
+        q, v = (samples.state[:, system.state_names.index(name)] for name in (position, velocity))
+        area = (v[1:] + v[:-1]) / 2 * samples.interval[:-1]
+        whole = torch.cat([area.new_zeros(1), area.cumsum(0)])
+        moved, expected = q[apart:] - q[:-apart], whole[apart:] - whole[:-apart]
+        good = same & moved.isfinite() & expected.isfinite()
+        if int(good.sum()) < 20:
+            continue
+        moved, expected = moved[good], expected[good]
+        slope = float((moved * expected).sum() / expected.square().sum().clamp_min(1e-300))
+        left = float((moved - expected).square().mean() / moved.square().mean().clamp_min(1e-300))
+        if abs(slope - 1.0) > 0.1 and left > 0.05:
+            found.append(
+                Finding(
+                    "velocity",
+                    f"{velocity} is not the slope of {position}: {position} moves {slope:.3g} "
+                    "times as far as it says.",
+                    "Check units and sign of the column, or leave it out: velocities need not be "
+                    "measured.",
+                )
+            )
+    return found
+
+
+def of_residuals(
+    system: System, samples: Samples, windows: Windows, fit: Fit
+) -> tuple[list[Finding], Residuals]:
+    """Whether residuals are white, and whether previous commands explain them."""
+    found, white = [], {}
+    steps = torch.arange(1, BEFORE + 1)
+    for i, name in enumerate(system.state_names):
+        mask = windows.mask[..., i]
+        if not mask.any():
+            continue
+        r = fit.residual[..., i] / fit.sigma[i]
+        r = torch.where(mask, r.clamp(-5.0, 5.0), 0.0)
+        power = r[mask].square().mean().clamp_min(1e-300)
+        white[name] = [
+            float(
+                (r[:, k:] * r[:, :-k]).sum()
+                / (mask[:, k:] & mask[:, :-k]).sum().clamp_min(1)
+                / power
+            )
+            for k in steps.tolist()
+        ]
+        if white[name][0] > _WHITE:
+            found.append(
+                Finding(
+                    "white",
+                    f"{name}: residuals one sample apart agree (correlation {white[name][0]:.2f}).",
+                    "The equations leave something out: add the term that is missing (friction, a "
+                    "spring, a stop) to the prior, or let a residual learn it.",
+                )
+            )
+        share = max(_explained(samples, windows, r, mask, i) for i in (0, 2))
+        if share > _EXPLAINED:
+            found.append(
+                Finding(
+                    "delay",
+                    f"{name}: the commands before explain {100 * share:.0f} % of the residual.",
+                    "The command acts late or slowly: let delay and lag be 'auto', or allow a "
+                    "larger largest_delay.",
+                )
+            )
+    return found, _residuals(system, samples, windows, fit, white)
+
+
+def _explained(
+    samples: Samples, windows: Windows, r: Tensor, mask: Tensor, differences: int
+) -> float:
+    """Share of the residuals (or their second differences) that previous commands explain."""
+    index = windows.index[:, differences:]
+    good = mask
+    for _ in range(differences):
+        r, good = r.diff(dim=1), good[:, 1:] & good[:, :-1]
+    known = good & (index - BEFORE - differences >= samples.first[index])
+    columns = [
+        samples.action[(index[known] - k).clamp_min(0)] for k in range(BEFORE + differences + 1)
+    ]
+    x, y = torch.cat(columns, -1), r[known]
+    if len(y) < 20 * x.shape[1]:
+        return 0.0
+    x, y = x - x.mean(0), y - y.mean()
+    solution = torch.linalg.lstsq(x, y[:, None], driver="gelsd").solution
+    left = (y - (x @ solution)[:, 0]).square().mean() / y.square().mean().clamp_min(1e-300)
+    return 1.0 - float(left)
+
+
+def _residuals(
+    system: System, samples: Samples, windows: Windows, fit: Fit, white: dict[str, list[float]]
+) -> Residuals:
+    """The residuals of real samples, as plain lists."""
+    real = torch.cat([windows.interval > 0, windows.interval[:, -1:] > -1.0], 1)
+    real[:, 1:] &= windows.time.diff(dim=1) > 0
+    index = windows.index[real]
+    residual = torch.where(windows.mask, fit.residual, torch.nan)[real]
+    names, actions = system.state_names, system.action_names
+    previous = {
+        f"{name} {k} before": samples.action[
+            torch.maximum(index - k, samples.first[index]), i
+        ].tolist()
+        for i, name in enumerate(actions)
+        for k in range(1, BEFORE + 1)
+    }
+    return Residuals(
+        time=samples.time[index].tolist(),
+        residual={
+            n: [v if v == v else None for v in residual[:, i].tolist()]
+            for i, n in enumerate(names) if n in white
+        },
+        state={n: fit.states[real][:, i].tolist() for i, n in enumerate(names)},
+        action={n: samples.action[index, i].tolist() for i, n in enumerate(actions)},
+        previous=previous,
+        autocorrelation=white,
+    )  # fmt: skip
+
+
+def of_errors(errors: Mapping[str, HorizonError]) -> list[Finding]:
+    """Predictions that are worse than the noise allows."""
+    if not errors:
+        return [
+            Finding(
+                "held_out",
+                "No stretch is long enough to be held out, so no prediction was judged.",
+                "Record longer stretches, or ask for shorter horizons.",
+            )
+        ]
+    steps = max(errors, key=int)
+    return [
+        Finding(
+            "error",
+            f"{name}: {steps} steps ahead the error is {error.rmse:.3g}, {error.floor_ratio:.1f} "
+            f"times the noise and {100 * error.share:.2g} % of the change.",
+            "Look at the residuals for what the equations leave out, and at the regions for where.",
+        )
+        for name, error in errors[steps].states.items()
+        if error.floor_ratio > _OVER
+    ]
