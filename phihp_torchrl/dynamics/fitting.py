@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -199,7 +200,7 @@ def _levenberg_marquardt(
     if config.shuffle_actions:
         order = torch.randperm(len(penalised_action), generator=generator)
         penalised_action = penalised_action[order]
-    reference = loss.transitions(held_out)
+    reference, seconds = _timed(loss, held_out), loss.time_step(train)
     theta = system.parameters()
     damping = 1e-2
     growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
@@ -212,6 +213,7 @@ def _levenberg_marquardt(
     while steps < config.steps:
         steps += 1
         rows: tuple[Tensor, ...] = (*transitions, penalised_action)
+        rows += () if seconds is None else (seconds,)
         if config.batch_size is not None and config.batch_size < len(train):
             index = torch.randint(len(train), (config.batch_size,), generator=generator)
             rows = tuple(part[index] for part in rows)
@@ -228,6 +230,12 @@ def _levenberg_marquardt(
     return steps
 
 
+def _timed(loss: DynamicsLoss, data: TensorDictBase) -> tuple[Tensor, ...]:
+    """The arguments of :meth:`DynamicsLoss.terms`, with time steps where the data have them."""
+    transition, seconds = loss.transitions(data), loss.time_step(data)
+    return transition if seconds is None else (*transition, transition[1], seconds)
+
+
 class _LeastSquares:
     """The residuals of the least-squares problem, and their Jacobian, by one parameter vector."""
 
@@ -235,9 +243,6 @@ class _LeastSquares:
         self.loss = loss
         self.named = dict(loss.named_parameters())
         self.sizes = [p.numel() for p in self.named.values()]
-        self._errors = vmap(self._error, (None, 0, 0, 0))
-        self._rows = vmap(self._row, (None, 0, 0, 0, 0))
-        self._jacobian = vmap(jacrev(self._row), (None, 0, 0, 0, 0))
 
     def parameters(self) -> Tensor:
         return torch.cat([p.detach().reshape(-1) for p in self.named.values()])
@@ -262,14 +267,17 @@ class _LeastSquares:
         return torch.cat([error, residual / self.loss.lambda_.sqrt()])
 
     def prediction_error(self, theta: Tensor, transitions: tuple[Tensor, ...]) -> float:
-        return self._errors(theta, *transitions).square().sum(-1).mean().item()
+        return _each(self._error)(theta, *transitions).square().sum(-1).mean().item()
+
+    def _rows(self, theta: Tensor, *rows: Tensor) -> Tensor:
+        return _each(self._row)(theta, *rows)
 
     def step(
         self, theta: Tensor, rows: tuple[Tensor, ...], damping: float
     ) -> tuple[Tensor, float, bool]:
         """Take one damped step: new parameters, new damping, and whether the cost has fallen."""
         values = self._rows(theta, *rows).reshape(-1)
-        jacobian = self._jacobian(theta, *rows).reshape(values.shape[0], -1)
+        jacobian = _each(jacrev(self._row))(theta, *rows).reshape(values.shape[0], -1)
         normal = (jacobian.mT @ jacobian).double()
         gradient = (jacobian.mT @ values).double()
         diagonal = normal.diagonal().clamp_min(1e-9 * normal.diagonal().max())
@@ -281,6 +289,15 @@ class _LeastSquares:
                 return candidate, max(damping / 5.0, 1e-10), True
             damping = min(damping * 4.0, 1e8)
         return theta, damping, False
+
+
+def _each(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Map a function of parameters and one transition over all transitions."""
+
+    def mapped(theta: Tensor, *rows: Tensor) -> Tensor:
+        return vmap(function, (None, *[0] * len(rows)))(theta, *rows)
+
+    return mapped
 
 
 class _Terms(torch.nn.Module):

@@ -165,14 +165,22 @@ class HybridDynamics(nn.Module):
         solver = make_integrator(integrator.pop("name"), **integrator)
         return cls(task, prior=prior, residual=residual, integrator=solver)
 
-    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+    def forward(self, state: Tensor, action: Tensor, time_step: Tensor | None = None) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
-        return self.step(state, self.task.clip_action(action))
+        return self.step(state, self.task.clip_action(action), time_step)
 
-    def step(self, state: Tensor, action: Tensor) -> Tensor:
-        """The next state for what acts on the system, as :meth:`Task.transition` needs it."""
+    def step(self, state: Tensor, action: Tensor, time_step: Tensor | None = None) -> Tensor:
+        """The next state for what acts on the system, as :meth:`Task.transition` needs it.
+
+        Args:
+            state: states ``[*batch, n]``.
+            action: what acts on the system, ``[*batch, m]``.
+            time_step: seconds for which each acts, ``[*batch, 1]``. Defaults to the time step of
+                the task.
+        """
+        seconds = self.task.time_step if time_step is None else time_step
         return self.integrator(
-            lambda s: self.derivative(s, action), state, self.task.time_step, self.task.layout
+            lambda s: self.derivative(s, action), state, seconds, self.task.layout
         )
 
     def derivative(self, state: Tensor, action: Tensor) -> Tensor:
@@ -193,19 +201,21 @@ class HybridDynamics(nn.Module):
         return residual / (prior + residual).clamp_min(torch.finfo(state.dtype).tiny)
 
     @torch.no_grad()
-    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+    def rollout(self, state: Tensor, actions: Tensor, time_step: Tensor | None = None) -> Tensor:
         """Predict the states of a sequence of actions.
 
         Args:
             state: first state, ``[*batch, n]``.
             actions: what acts on the system in each step, ``[*batch, time, m]``.
+            time_step: seconds for which each acts, ``[*batch, time, 1]``. Defaults to the time
+                step of the task.
 
         Returns:
             States after each action, ``[*batch, time, n]``.
         """
         states = []
-        for action in actions.unbind(-2):
-            state = self.step(state, action)
+        for k, action in enumerate(actions.unbind(-2)):
+            state = self.step(state, action, None if time_step is None else time_step[..., k, :])
             states.append(state)
         return torch.stack(states, -2)
 

@@ -15,6 +15,8 @@ from phihp_torchrl.config import ConfigError, check_count
 
 Derivative = Callable[[Tensor], Tensor]
 """A vector field ``state [*batch, n] -> ds/dt [*batch, n]``, for an action that is held."""
+TimeStep = float | Tensor
+"""Seconds: a number, or a tensor ``[*batch, 1]``."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +95,12 @@ class Integrator(abc.ABC):
 
     @abc.abstractmethod
     def __call__(
-        self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
+        self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
-        """Return the state ``time_step`` seconds after ``state`` ``[*batch, n]``, same shape."""
+        """Return the state ``time_step`` seconds after ``state`` ``[*batch, n]``, same shape.
+
+        The time step is a number, or a tensor ``[*batch, 1]`` with one for each state.
+        """
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -119,7 +124,7 @@ class FixedStepIntegrator(Integrator):
         check_count(self, "substeps")
 
     def __call__(
-        self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
+        self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
         for _ in range(self.substeps):
             state = self.step(derivative, state, time_step / self.substeps, layout)
@@ -127,6 +132,6 @@ class FixedStepIntegrator(Integrator):
 
     @abc.abstractmethod
     def step(
-        self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
+        self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
         """Return the state one solver step of ``time_step`` seconds later, same shape."""

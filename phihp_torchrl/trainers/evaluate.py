@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
 from phihp_torchrl.worlds import World
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class EvaluatePhase:
         agent: the agent.
         config: settings of the run.
         settings: the section of this phase.
-        world: the world in which the agent plays.
+        world: the world in which the agent plays; in one of recordings it is saved alone.
         directory: directory of the run, for agent, pictures and ``evaluation.json``.
         samples: real steps that were taken to train the agent.
     """
@@ -88,9 +91,9 @@ class EvaluatePhase:
         self.results: dict[str, dict[str, Any]] = {}
         self.new_files: list[NewFile] = []
         self._steps: list[tuple[str, Agent]] = []
-        if agent.planner is not None:
+        if agent.planner is not None and world.has_env:
             self._steps.append(("planner", agent))
-        if agent.actor is not None:
+        if agent.actor is not None and world.has_env:
             self._steps.append(("actor", agent.actor_alone()))
         self._finished = False
 
@@ -110,7 +113,13 @@ class EvaluatePhase:
         if len(self.results) < len(self._steps):
             return self._evaluate(*self._steps[len(self.results)])
         self._save()
-        self._show()
+        if self.world.has_env:
+            self._show()
+        else:
+            _log.warning(
+                "%s has recordings alone: the agent is saved without having played in it.",
+                self.world,
+            )
         self._finished = True
         return {}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -33,13 +33,23 @@ from phihp_torchrl.dynamics import (
 )
 from phihp_torchrl.imagination import Batch
 from phihp_torchrl.integrators import check_integrator, has_substeps, integrator_of
+from phihp_torchrl.recordings import transitions
 from phihp_torchrl.tasks import Task
-from phihp_torchrl.trainers.collect import CollectConfig, planning_policy, random_policy
+from phihp_torchrl.trainers.collect import (
+    CollectConfig,
+    drop_unusable,
+    planning_policy,
+    random_policy,
+    steady,
+)
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, register_phase
 from phihp_torchrl.worlds import SimulatedWorld, World, disagreements, make_world
 
 _log = logging.getLogger(__name__)
+
+_SAME_STEP = 1e-3
+"""Recorded time steps within this share of the task's are the task's."""
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 
@@ -49,7 +59,8 @@ class ModelConfig:
     """Settings of phase 1, which learns the model (paper, section 4.1 and appendix C).
 
     Args:
-        real_steps: total number of real transitions; 0 is allowed for an oracle.
+        real_steps: total number of real transitions; 0 is allowed for an oracle. A recorded world
+            gives all that it has.
         steps_per_iteration: real transitions between two fits, T; null for a tenth of all of them,
             but at least 50.
         kind: hybrid (prior + residual), data_driven (no prior), prior (no residual) or oracle (the
@@ -186,7 +197,11 @@ class ModelTrainer:
     """Phase 1: learns the model from real steps (paper, section 4.1 and appendix C).
 
     It alternates between collecting real steps, at random in the first iteration and by planning
-    in later ones, and fitting the model.
+    in later ones, and fitting the model. In a world that has recordings alone, it fits the model
+    once, to all their transitions.
+
+    Steps of which a number is missing are left out, with a warning. A run saves new steps before it
+    fits the model to them, so that a fit that fails costs no step.
 
     Args:
         task: the task.
@@ -215,30 +230,42 @@ class ModelTrainer:
         self.task = task
         self.config = config
         self.world = make_world(task, world)
-        self.env = self.world.make_env()
+        self.env = self.world.make_env() if self.world.has_env else None
+        self.recorded = _recorded(self.world)
         self.generator = torch.Generator().manual_seed(seed)
         self.dynamics = make_dynamics(self.world, config, self.generator)
         self.initial = {k: v.clone() for k, v in self.dynamics.state_dict().items()}
         self.loss = DynamicsLoss(self.dynamics, lambda_0=config.lambda_0, tau_ph=config.tau_ph)
         self.data: TensorDict | None = None
         self.iteration = 0
+        self.keep: Callable[[], None] | None = None
+        """What saves the run; it is called when there are new real steps."""
+        self._new, self._dropped = 0, 0  # steps not yet fitted, and those left out
         self._told: set[str] = set()
-        self.env.set_seed(self._draw_seed())
+        seed_of_env = self._draw_seed()
+        if self.env is not None:
+            self.env.set_seed(seed_of_env)
 
     @property
     def real_steps(self) -> int:
-        """Real transitions so far."""
-        return 0 if self.data is None else len(self.data)
+        """Real steps so far, with those that were left out."""
+        return self._dropped + (0 if self.data is None else len(self.data))
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Real transitions so far and in all."""
-        return self.real_steps, self.config.real_steps
+        """Real steps so far and in all."""
+        total = self.config.real_steps if self.recorded is None else len(self.recorded)
+        return self.real_steps, total
 
     @property
     def done(self) -> bool:
         """Whether all real transitions are collected and fitted."""
-        return self.real_steps >= self.config.real_steps
+        return self._has_all and not self._new
+
+    @property
+    def _has_all(self) -> bool:
+        steps, total = self.progress
+        return steps >= total
 
     def states(self) -> Tensor:
         """Return all states of the real data, ``[N, n]``."""
@@ -263,18 +290,33 @@ class ModelTrainer:
 
     def advance(self) -> dict[str, float]:
         """Collect once and fit once; returns metrics."""
-        steps = min(self.config.period, self.config.real_steps - self.real_steps)
-        new = self.collect(steps)
-        self.data = new if self.data is None else torch.cat([self.data, new])
-        self.iteration += 1
+        if not self._new:  # else a fit has failed, and is tried again on the same steps
+            steps = min(self.config.period, self.config.real_steps - self.real_steps)
+            new = self.collect(steps) if self.recorded is None else self.recorded
+            self.data = new if self.data is None else torch.cat([self.data, new])
+            self.iteration += 1
+            self._new = len(new)
+            if self.keep is not None:
+                self.keep()
+        assert self.data is not None
         self._tell_disagreements()
-        metrics = {"real_steps": self.real_steps, "collect/reward": new["next", "reward"].mean()}
+        reward = self.data["next", "reward"][-self._new :].mean()
+        metrics = {"real_steps": self.real_steps, "collect/reward": reward}
+        if self._dropped:
+            metrics["collect/dropped"] = self._dropped
         if self.config.kind != "oracle":
             metrics |= self.fit()
+        self._new = 0
         return {name: float(value) for name, value in metrics.items()}
 
     def collect(self, steps: int) -> TensorDict:
-        """Take real steps: at random in the first iteration, with the planner in later ones."""
+        """Take real steps: at random in the first iteration, with the planner in later ones.
+
+        Raises:
+            ConfigError: for a world of recordings, and if too many steps miss a number.
+        """
+        if self.env is None:
+            raise ConfigError("world", f"{self.world} has recordings alone, nobody can act in it.")
         config, generator = self.config, self.generator
         if self.iteration == 0:
             policy = random_policy(self.task, config.collect, generator)
@@ -286,10 +328,11 @@ class ModelTrainer:
         # Each iteration has its seed, so that a resumed run has the same resets.
         self.env.set_seed(self._draw_seed())
         with torch.no_grad():
+            policy = steady(self.task, policy)
             rollout = self.env.rollout(steps, policy, break_when_any_done=False)
         done = rollout["next", "done"].clone()
         done[-1] = True  # the next rollout starts from a reset
-        return TensorDict(
+        data = TensorDict(
             observation=rollout["observation"].float(),
             action=rollout["action"].float(),
             next=TensorDict(
@@ -301,6 +344,9 @@ class ModelTrainer:
             ),
             batch_size=[steps],
         ).detach()
+        data, dropped = drop_unusable(data)
+        self._dropped += dropped
+        return data
 
     def _tell_disagreements(self) -> None:
         """Warn where real transitions contradict the task, when first seen and at the end."""
@@ -308,7 +354,7 @@ class ModelTrainer:
             return
         for sentence in disagreements(self.task, self.data):
             about = sentence.split(" of ")[0].rstrip("0123456789 ")
-            if about not in self._told or self.done:
+            if about not in self._told or self._has_all:
                 self._told.add(about)
                 _log.warning("After %d real steps: %s.", self.real_steps, sentence)
 
@@ -318,7 +364,7 @@ class ModelTrainer:
         if not self.config.warm_start:
             self.dynamics.load_state_dict(self.initial)
             self.loss.lambda_.fill_(self.config.lambda_0)
-        elif self.iteration > 1 and not self.done:
+        elif self.iteration > 1 and not self._has_all:
             config = replace(
                 config,
                 steps=min(config.steps, self.config.refit_steps),
@@ -351,6 +397,8 @@ class ModelTrainer:
             "loss": {name: buffer for name, buffer in self.loss.named_buffers(recurse=False)},
             "data": None if self.data is None else self.data.to_dict(),
             "iteration": self.iteration,
+            "new": self._new,
+            "dropped": self._dropped,
             "generator": self.generator.get_state(),
         }
 
@@ -363,10 +411,24 @@ class ModelTrainer:
         data = state["data"]
         self.data = None if data is None else TensorDict(data).auto_batch_size_(1)
         self.iteration = state["iteration"]
+        self._new, self._dropped = state.get("new", 0), state.get("dropped", 0)
         self.generator.set_state(state["generator"])
 
     def _draw_seed(self) -> int:
         return int(torch.randint(2**31, (), generator=self.generator))
+
+
+def _recorded(world: World) -> TensorDict | None:
+    """All transitions of a world that has recordings alone; ``None`` for other worlds."""
+    if world.has_env:
+        return None
+    if world.recordings is None:
+        raise ConfigError("world", f"{world} has neither an environment nor recordings.")
+    data = transitions(world.task, world.recordings)
+    # Equal time steps are the task's, for which a model is faster.
+    if torch.allclose(data["time_step"], torch.tensor(world.task.time_step), rtol=_SAME_STEP):
+        del data["time_step"]
+    return data
 
 
 def _build(context: Context) -> Phase:

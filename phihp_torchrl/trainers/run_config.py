@@ -309,6 +309,14 @@ def check_run(config: RunConfig, world: World) -> None:
             f"of task {task.name!r}, {type(task.system).__name__}, has none; expected "
             "'data_driven' or a method that needs none.",
         )
+    if not world.has_env:
+        phases = [name for name in config.phases_to_do if PHASES[name].needs_env]
+        if phases:
+            raise ConfigError(
+                "method",
+                f"expected one that does without acting in the world, {config.method!r} acts in it "
+                f"in {phases}, and {world} has recordings alone.",
+            )
     if world.truth is None:
         phases = [name for name in config.phases_to_do if PHASES[name].needs_truth]
         if phases:

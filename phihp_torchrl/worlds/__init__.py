@@ -1,10 +1,11 @@
-"""Worlds, the source of real steps: simulated, gymnasium's, or any TorchRL environment."""
+"""Worlds, the source of real steps: simulated, gymnasium's, any TorchRL environment, or recordings."""
 
 from __future__ import annotations
 
 from phihp_torchrl.worlds.agreement import disagreements
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.gymnasium import GymnasiumConfig, GymnasiumWorld
+from phihp_torchrl.worlds.recorded import RecordedConfig, RecordedWorld
 from phihp_torchrl.worlds.registry import (
     WORLDS,
     GivenConfig,
@@ -31,6 +32,8 @@ __all__ = [
     "GymnasiumConfig",
     "GymnasiumWorld",
     "Plant",
+    "RecordedConfig",
+    "RecordedWorld",
     "SimulatedConfig",
     "SimulatedWorld",
     "TaskEnv",
