@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import torch
@@ -24,11 +23,11 @@ def given_path(config: IdentifyConfig) -> Actuator:
     numbers = {
         "delay_steps": config.delay,
         "lag": config.lag,
-        "slew": config.slew or math.inf,
+        "slew": config.slew or None,
         "dead_zone": config.dead_zone,
         "gain_low": config.gain_low,
     }
-    return replace(neutral, **{n: float(v) for n, v in numbers.items() if v != AUTO})
+    return replace(neutral, **{n: v for n, v in numbers.items() if v not in (AUTO, None)})
 
 
 class Chooser:
@@ -71,12 +70,12 @@ class Chooser:
                 self.best = trial
             elif delay > self._delay() + 1:
                 break
-        start = self._delay() - 0.5 if self._delay() else 0.5
+        start = abs(self._delay() - 0.5)
         trial = self._consider(
             "delay with a fraction", self.best.model.with_part("delay_steps", start)
         )
-        delay = trial.raw[-1].item()
-        if abs(delay - round(delay)) > _WHOLE and self.trials.better(trial, self.best):
+        found = trial.raw[-1].item()
+        if abs(found - round(found)) > _WHOLE and self.trials.better(trial, self.best):
             self.best = trial
 
     def choose_lag(self) -> None:

@@ -8,7 +8,8 @@ from typing import Literal
 
 from phihp_torchrl.config import ConfigError, check_choice, check_count, is_whole
 
-AUTO = "auto"
+Auto = Literal["auto"]
+AUTO: Auto = "auto"
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,8 @@ class IdentifyConfig:
     Args:
         window: samples in a fitted window, whose start is free.
         windows: windows that are fitted at most, spread over the recordings.
-        past: samples before a prediction, from which its start is estimated.
+        past: samples before a prediction, from which its start is estimated; where stretches are
+            short, a quarter of them has to do.
         horizons: steps ahead at which predictions are judged.
         delay: dead time of the actions in steps of the recordings, or ``"auto"``.
         largest_delay: the longest delay that is tried.
@@ -45,14 +47,14 @@ class IdentifyConfig:
 
     window: int = 40
     windows: int = 300
-    past: int = 50
+    past: int = 100
     horizons: tuple[int, ...] = (1, 5, 20)
-    delay: float | Literal["auto"] = AUTO
+    delay: float | Auto = AUTO
     largest_delay: int = 5
-    lag: float | Literal["auto"] = AUTO
-    slew: float | Literal["auto"] = AUTO
-    dead_zone: float | Literal["auto"] = AUTO
-    gain_low: float | Literal["auto"] = AUTO
+    lag: float | Auto = AUTO
+    slew: float | Auto = AUTO
+    dead_zone: float | Auto = AUTO
+    gain_low: float | Auto = AUTO
     integrator: Literal["auto", "rk4", "semi_implicit_euler"] = AUTO
     substeps: int = 0
     stops: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -69,8 +71,8 @@ class IdentifyConfig:
         for name in ("delay", "lag", "slew", "dead_zone", "gain_low"):
             value = getattr(self, name)
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            least = 0 < value if name == "gain_low" and number else number and value >= 0
-            if value != AUTO and not least:
+            good = number and (value > 0 if name == "gain_low" else value >= 0)
+            if value != AUTO and not good:
                 raise ConfigError(
                     name, f"expected {AUTO!r} or a number of at least 0, got {value!r}."
                 )

@@ -1,4 +1,4 @@
-"""How sure a fit is: directions of its parameters that the data leave open, and errors of others."""
+"""How sure a fit is: directions that the data leave open, and errors of the others."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ class Uncertainty:
         sandwich: covariance ``[p, p]`` that holds where residuals of one window belong together, as
             they do where the equations leave something out (White, 1980; one cluster a window).
         plain: covariance ``[p, p]`` for independent residuals of the estimated noise.
-        quantile: standard errors on each side of a 95 % interval.
+        quantile: standard errors on each side of an interval. All intervals together hold with
+            95 % (Bonferroni's inequality, for as many as there are parameters that are not open).
     """
 
     scale: Tensor
@@ -56,8 +57,10 @@ def uncertainty(fit: Fit, scale: Tensor) -> Uncertainty:
     information = fit.information / (scale[:, None] * scale)
     information = 0.5 * (information + information.mT)
     scores = fit.scores / scale
-    clusters = len(scores)
-    meat = scores.mT @ scores * (clusters / max(1, clusters - 1))
+    clusters, count = scores.shape
+    # Residuals are smaller than errors, for parameters and starts have been fitted to them.
+    used = count / clusters + fit.starts.shape[1] / max(_measurements(fit), 1.0)
+    meat = scores.mT @ scores / max(1.0 - used, 0.5)
     values, vectors = torch.linalg.eigh(information)
     values = values.clamp_min(1e-12)
     spread = (vectors * (meat @ vectors)).sum(0) / values.square()
@@ -65,13 +68,23 @@ def uncertainty(fit: Fit, scale: Tensor) -> Uncertainty:
     closed = error <= _OPEN
     bread = (vectors[:, closed] / values[closed]) @ vectors[:, closed].mT
     return Uncertainty(
-        scale, vectors[:, ~closed].mT, bread @ meat @ bread, bread, _quantile(clusters - 1)
+        scale,
+        vectors[:, ~closed].mT,
+        bread @ meat @ bread,
+        bread,
+        _quantile(clusters - 1, max(int(closed.sum()), 1)),
     )
 
 
-def _quantile(freedom: int) -> float:
-    """The 97.5 % quantile of Student's t (Fisher and Cornish's expansion)."""
-    z, n = 1.959964, max(freedom, 3)
+def _measurements(fit: Fit) -> float:
+    """Measurements in a window, on average."""
+    return float((fit.residual != 0).sum() / len(fit.residual))
+
+
+def _quantile(freedom: int, intervals: int) -> float:
+    """The quantile of Student's t for so many intervals (Fisher and Cornish's expansion)."""
+    level = torch.tensor(1.0 - 0.025 / intervals, dtype=torch.float64)
+    z, n = float(torch.special.ndtri(level)), max(freedom, 3)
     return z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
 
 

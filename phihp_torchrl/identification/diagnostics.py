@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
+from phihp_torchrl.identification.fitting import Fitted
 from phihp_torchrl.identification.parts import (
     AT_LIMIT,
-    COMBINED,
     FIXED,
     IDENTIFIED,
+    NOT_IDENTIFIED,
     Estimate,
     Finding,
     HorizonError,
     Residuals,
 )
 from phihp_torchrl.identification.shooting import Fit
+from phihp_torchrl.identification.stops import Stops
 from phihp_torchrl.identification.windows import Samples, Windows
 from phihp_torchrl.systems import System
 
@@ -32,15 +35,18 @@ _OVER = 2.0
 def of_constants(constants: Mapping[str, Estimate]) -> list[Finding]:
     """Constants that the data do not determine, and those at a limit."""
     found = []
+    groups: dict[str, list[str]] = {}
     for name, c in constants.items():
         if c.verdict == AT_LIMIT:
             text = f"{name} is at its limit ({c.estimate:.4g})."
             found.append(Finding("limit", text, c.advice))
+        elif c.verdict == NOT_IDENTIFIED:
+            found.append(Finding("unknown", f"{name} is not identified by these data.", c.advice))
         elif c.verdict not in (IDENTIFIED, FIXED):
-            text = f"{name}: {c.verdict}."
-            found.append(
-                Finding("combination" if COMBINED in c.verdict else "unknown", text, c.advice)
-            )
+            groups.setdefault(c.advice, []).append(name)
+    for advice, names in groups.items():
+        text = f"Of {', '.join(names)} only combinations are identified."
+        found.append(Finding("combination", text, advice))
     return found
 
 
@@ -225,3 +231,33 @@ def of_errors(errors: Mapping[str, HorizonError]) -> list[Finding]:
         for name, error in errors[steps].states.items()
         if error.floor_ratio > _OVER
     ]
+
+
+def of_fit(stopped: Tensor, stops: Stops, fitted: Fitted) -> list[Finding]:
+    """Samples at stops, and windows that the equations do not describe."""
+    found = []
+    if stopped.any():
+        what = ", ".join(
+            f"{n} at {' and '.join(f'{x:.4g}' for x in pair if math.isfinite(x))}"
+            for n, pair in stops.items()
+        )
+        origin = "found in the data" if fitted.found else "known"
+        found.append(
+            Finding(
+                "stops",
+                f"{int(stopped.sum())} of {len(stopped)} samples at stops were left out ({what}; "
+                f"{origin}).",
+                "Give the task its position limits, so that imagination and planning stop there "
+                "too; errors at stops are in the region 'stop'.",
+            )
+        )
+    if fitted.outlying:
+        found.append(
+            Finding(
+                "outliers",
+                f"{fitted.outlying} of {fitted.outlying + len(fitted.windows.time)} windows are "
+                "not described by the equations at all, and were left out.",
+                "Look for contacts, outliers of a sensor, or commands that were not logged.",
+            )
+        )
+    return found

@@ -4,19 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from phihp_torchrl.identification.division import Division, spread
 from phihp_torchrl.identification.held_out import BINS, Span, region
 from phihp_torchrl.identification.model import Model
 from phihp_torchrl.identification.parts import HorizonError, Region, Rollout, StateError
-from phihp_torchrl.identification.shooting import Shooting, simulate
-from phihp_torchrl.identification.windows import Samples, Windows, first_starts, make_windows
+from phihp_torchrl.identification.shooting import Fit, Shooting, simulate
+from phihp_torchrl.identification.windows import (
+    Samples,
+    Windows,
+    cut,
+    first_starts,
+    make_windows,
+    runs,
+)
 from phihp_torchrl.recordings import Recording
 
-LEAST_PAST = 10
-"""Samples before a prediction that its start needs at least."""
+_PICTURES = 6
+"""Predictions of which the samples are kept."""
+_AT_STOPS = 40
+"""Stretches at stops that are predicted."""
 _STRIDE = 10
 """Samples from one prediction to the next."""
 
@@ -47,7 +58,7 @@ def predict(
     sigma: Tensor,
     held: Sequence[Span],
     inside: Sequence[Span],
-    past: int,
+    past: tuple[int, int],
     ahead: int,
 ) -> Predictions | None:
     """Predict ``ahead`` steps from places in held-out spans.
@@ -59,7 +70,7 @@ def predict(
         sigma: noise of each state.
         held: held-out spans.
         inside: the spans that hold them, in which a past may reach back.
-        past: samples of the past at most.
+        past: samples of the past, at least and at most.
         ahead: steps.
 
     Returns:
@@ -68,8 +79,8 @@ def predict(
     spans, origins = [], []
     for a, b in held:
         begin = next(x for x, y in inside if x <= a and b <= y)
-        for last in range(max(a - 1, begin + LEAST_PAST - 1), b - ahead, _STRIDE):
-            first = max(begin, last + 1 - past)
+        for last in range(max(a - 1, begin + past[0] - 1), b - ahead, _STRIDE):
+            first = max(begin, last + 1 - past[1])
             spans.append((first, last + ahead + 1))
             origins.append(last - first)
     if not spans:
@@ -83,16 +94,8 @@ def predict(
     return Predictions(windows, origin, simulate(model, raw, fit.starts, acting, windows))
 
 
-def horizon_errors(
-    names: Sequence[str], found: Predictions, sigma: Tensor, horizons: Sequence[int]
-) -> dict[str, HorizonError]:
-    """Errors by number of steps ahead."""
-    everywhere = torch.ones(len(found.origin), dtype=torch.bool)
-    return {str(h): horizon_error(names, found, sigma, h, everywhere) for h in horizons}
-
-
 def horizon_error(
-    names: Sequence[str], found: Predictions, sigma: Tensor, steps: int, among: Tensor
+    names: Sequence[str], found: Predictions, sigma: Tensor, steps: int, among: Tensor | None = None
 ) -> HorizonError:
     """Errors some steps ahead, of some of the predictions.
 
@@ -101,12 +104,14 @@ def horizon_error(
         found: the predictions.
         sigma: noise of each state.
         steps: steps ahead.
-        among: which predictions, bool ``[W]``.
+        among: which predictions, bool ``[W]``; by default all.
     """
     rows = torch.arange(len(found.origin))
     at = found.origin + steps
     error = (found.states - found.windows.measured)[rows, at]
-    mask = found.windows.mask[rows, at] & among[:, None]
+    mask = found.windows.mask[rows, at]
+    if among is not None:
+        mask = mask & among[:, None]
     before = found.windows.mask[rows, found.origin] & mask
     change = found.windows.measured[rows, at] - found.windows.measured[rows, found.origin]
     states = {}
@@ -138,9 +143,9 @@ def by_regions(names: Sequence[str], found: Predictions, sigma: Tensor, steps: i
         part = region(begun[:, i], low, high)
         for k in range(BINS):
             among = part == k
-            ends = [float(low + (high - low) * j / BINS) for j in (k, k + 1)]
+            begin, end = (float(low + (high - low) * j / BINS) for j in (k, k + 1))
             error = horizon_error(names, found, sigma, steps, among)
-            regions.append(Region(name, *ends, int(among.sum()), error.states))
+            regions.append(Region(name, begin, end, int(among.sum()), error.states))
     return regions
 
 
@@ -179,3 +184,41 @@ def pictures(
             )
         )
     return rollouts
+
+
+class Judged(NamedTuple):
+    """Errors by steps ahead, errors by regions at the longest horizon, and pictures."""
+
+    errors: dict[str, HorizonError]
+    regions: list[Region]
+    rollouts: list[Rollout]
+
+
+def judge_predictions(
+    model: Model,
+    samples: Samples,
+    fit: Fit,
+    division: Division,
+    past: tuple[int, int],
+    recordings: Sequence[Recording],
+) -> Judged:
+    """Predict what was held out, and, apart from that, what happens at stops."""
+    names, actions = model.prior.system.state_names, model.prior.system.action_names
+    if not division.held:
+        return Judged({}, [], [])
+    ahead = division.horizons[-1]
+    plain = (model, samples, fit.raw, fit.sigma)
+    found = predict(*plain, division.held, division.inside, past, ahead)
+    if found is None:
+        return Judged({}, [], [])
+    errors = {h: horizon_error(names, found, fit.sigma, h) for h in division.horizons}
+    regions = by_regions(names, found, fit.sigma, ahead)
+    rollouts = pictures(names, actions, found, samples, recordings, _PICTURES)
+    whole = runs(samples, torch.ones_like(division.stopped))
+    near = [(a, b) for a, b in cut(whole, ahead + 10, ahead) if division.stopped[a:b].any()]
+    met = predict(*plain, spread(near, _AT_STOPS), whole, past, ahead)
+    if met is not None:
+        error = horizon_error(names, met, fit.sigma, ahead)
+        regions.append(Region("stop", None, None, len(met.origin), error.states))
+        rollouts += pictures(names, actions, met, samples, recordings, 2, at_stop=True)
+    return Judged({str(h): error for h, error in errors.items()}, regions, rollouts)

@@ -1,4 +1,4 @@
-"""Which parts of the recordings take no part in the fit: blocks, from every region of the states."""
+"""Which samples take no part in the fit: blocks of them, from every region of the states."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Span = tuple[int, int]
 
 
 def hold_out(
-    samples: Samples, spans: Sequence[Span], length: int, least: int
+    samples: Samples, spans: Sequence[Span], length: int, past: int, ahead: int
 ) -> tuple[list[Span], list[Span]]:
     """Divide spans of samples into what is fitted and what is held out.
 
@@ -31,13 +31,15 @@ def hold_out(
         samples: the recordings.
         spans: usable samples, each within one recording.
         length: samples in a block.
-        least: shorter blocks are never held out.
+        past: samples that a prediction needs before it; they may lie before the block.
+        ahead: samples that are predicted, all in the block; other blocks are never held out.
 
     Returns:
         Spans to fit, and held-out spans, both in the order of time.
     """
     blocks = cut(spans, length, 1)
-    able = [i for i, (a, b) in enumerate(blocks) if b - a >= least]
+    begin = {a: begun for begun, end in spans for a, b in blocks if begun <= a and b <= end}
+    able = [i for i, (a, b) in enumerate(blocks) if max(a, begin[a] + past) + ahead <= b]
     if len(able) < 2:
         return list(spans), []
     kinds = _kinds(samples, [blocks[i] for i in able])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -82,8 +81,7 @@ class ActuatorEstimate:
     @property
     def actuator(self) -> Actuator | None:
         """The fitted actuator, or ``None`` where a command acts as it is and at once."""
-        slew = math.inf if self.slew is None else self.slew
-        found = Actuator(self.delay_steps, self.lag_s, slew, self.dead_zone, self.gain_low)
+        found = Actuator(self.delay_steps, self.lag_s, self.slew, self.dead_zone, self.gain_low)
         return found if found.config else None
 
 

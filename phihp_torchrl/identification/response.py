@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from phihp_torchrl.tasks import Actuator
 
 _CHUNK = 64
 """Samples that one row of the scan yields."""
-_FORGOTTEN = 25.0
+_FORGOTTEN = 16.0
 """Time constants after which a lag has forgotten what was before."""
 
 
@@ -55,21 +56,19 @@ def respond(samples: Samples, actuator: Actuator) -> Tensor:
 
 def memory(samples: Samples, actuator: Actuator) -> int:
     """How many samples back a command still acts."""
-    slew = actuator.slew if isinstance(actuator.slew, float) else min(actuator.slew)
     delay, lag = (
         value if isinstance(value, float) else max(value)
         for value in (actuator.delay_steps, actuator.lag)
     )
-    reach = float(samples.action.amax() - samples.action.amin()) if math.isfinite(slew) else 0.0
-    steps = (_FORGOTTEN * lag + reach / slew) / samples.step
+    seconds = _FORGOTTEN * lag
+    if actuator.slew is not None:
+        slew = actuator.slew if isinstance(actuator.slew, float) else min(actuator.slew)
+        seconds += float(samples.action.amax() - samples.action.amin()) / slew
+    steps = seconds / samples.step
     return min(math.ceil(delay) + math.ceil(steps) + 1, len(samples.action))
 
 
 def _rows(samples: Samples) -> list[tuple[int, int]]:
     """Spans of at most a chunk, each within one episode, that cover all samples."""
     edges = [0, *((samples.first.diff() != 0).nonzero().flatten() + 1).tolist(), len(samples.first)]
-    return [
-        (at, min(at + _CHUNK, b))
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
-        for at in range(a, b, _CHUNK)
-    ]
+    return [(at, min(at + _CHUNK, b)) for a, b in pairwise(edges) for at in range(a, b, _CHUNK)]

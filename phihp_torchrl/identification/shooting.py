@@ -87,6 +87,7 @@ class Shooting:
         if teaching is not None:
             self.teaching = teaching
         self.guess = model.first()
+        self._known: tuple[Tensor, Tensor] | None = None
         spread = samples.state.nan_to_num().std(0)
         self.scale = torch.cat([spread.clamp_min(1e-3), samples.action.std(0).clamp_min(1e-3)])
 
@@ -144,13 +145,19 @@ class Shooting:
     def _evaluate(self, raw: Tensor, starts: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor, float]:
         """Trajectories, residuals in units of the standard deviations, and the cost."""
         windows = self.windows
-        acting = self.model.acting(self.samples, raw)[windows.index]
-        states = simulate(self.model, raw, starts, acting, windows)
+        states = simulate(self.model, raw, starts, self._acting(raw), windows)
         error = (states - windows.measured) / sigma
         residual = torch.where(windows.mask, error, torch.zeros_like(error))
         believed = ((raw - self.guess) / _SPREAD).square().sum()
         value = float(robust(residual[self.teaching]).sum() + believed)
         return states, residual, value if value == value else float("inf")
+
+    def _acting(self, raw: Tensor) -> Tensor:
+        """What acts in each window, ``[W, L, m]``; it is known from the last call for the same."""
+        parts = raw[self.model.constants :]
+        if self._known is None or not torch.equal(self._known[0], parts):
+            self._known = parts, self.model.acting(self.samples, raw)[self.windows.index]
+        return self._known[1]
 
     def _sensitivities(self, raw: Tensor, states: Tensor, learn: bool) -> tuple[Tensor, Tensor]:
         """Derivatives of the states by the parameters and the starts, ``[W, L, n, p | n]``.
@@ -160,8 +167,7 @@ class Shooting:
         """
         windows, model = self.windows, self.model
         count, length, size = states.shape
-        acting = model.acting(self.samples, raw)[windows.index]
-        flat = [x[:, :-1].flatten(0, 1) for x in (states, acting)]
+        flat = [x[:, :-1].flatten(0, 1) for x in (states, self._acting(raw))]
         by_state, by_action, by_constant = model.slopes(
             raw, flat[0], flat[1], windows.interval.flatten(), self.scale, learn=learn
         )

@@ -9,7 +9,7 @@ from typing import Any
 def lay_out(found: Mapping[str, Any]) -> str:
     """Lines of text for the plain values of an identification."""
     parts = [_constants(found), _actuator(found["actuator"]), _errors(found)]
-    parts += [f"! {warning}" for warning in found["warnings"]]
+    parts.append("\n".join(f"! {warning}" for warning in found["warnings"]))
     return "\n\n".join(part for part in parts if part)
 
 

@@ -1,4 +1,4 @@
-"""Fits of few windows, which tell one model from another by windows that they were not fitted to."""
+"""Small fits, which tell one model from another by windows that they were not fitted to."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Trials:
         return float(total)
 
     def better(self, trial: Trial, best: Trial) -> bool:
-        """Whether the error is lower by three standard errors of paired windows, and by half a percent."""
+        """Whether windows are better by three standard errors of pairs, and by half a percent."""
         sigma = self.noise(best)
         gain = self.losses(best, sigma) - self.losses(trial, sigma)
         error = gain.std() / len(gain) ** 0.5

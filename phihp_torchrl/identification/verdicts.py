@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from phihp_torchrl.identification.parts import (
     ActuatorTrial,
     Estimate,
 )
-from phihp_torchrl.systems import Constant
+from phihp_torchrl.systems import Constant, System
 
 _NEAR = 0.01
 """Share of its range, or of its first guess, at which a constant counts as at its limit."""
@@ -78,11 +79,11 @@ def judge_constants(
             )
         else:
             shift = unit * doubt.reach(unit) / doubt.scale
-            ends = [
+            low, high = (
                 float(model.prior.decode((raw + sign * shift)[: model.constants])[name])
                 for sign in (-1.0, 1.0)
-            ]
-            found[name] = Estimate(c.guess, values[name], *ends)
+            )
+            found[name] = Estimate(c.guess, values[name], low, high)
     return found
 
 
@@ -112,12 +113,7 @@ def judge_combinations(model: Model, raw: Tensor, doubt: Uncertainty) -> dict[st
     found = {}
     for name in system.identifiable(guesses):
         if name not in guesses:
-            found[name] = _combination(
-                model,
-                raw,
-                doubt,
-                lambda c, name=name: torch.as_tensor(system.identifiable(c)[name]),
-            )
+            found[name] = _combination(model, raw, doubt, partial(_declared, system, name))
     positive = [
         i
         for i, name in enumerate(model.prior.learned)
@@ -126,14 +122,25 @@ def judge_combinations(model: Model, raw: Tensor, doubt: Uncertainty) -> dict[st
     for exponents in monomials(doubt.open, positive) or []:
         powers = {model.prior.learned[i]: power for i, power in exponents.items()}
         if len(powers) > 1:
-            estimate = _combination(model, raw, doubt, lambda c, powers=powers: _product(c, powers))
+            estimate = _combination(model, raw, doubt, partial(_product, powers))
             if estimate.low is not None:
                 found[product_name(powers)] = estimate
     return found
 
 
+def _declared(system: System, name: str, constants: Mapping[str, Tensor]) -> Tensor:
+    return torch.as_tensor(system.identifiable(constants)[name])
+
+
+def _product(powers: Mapping[str, float], constants: Mapping[str, Tensor]) -> Tensor:
+    value = torch.ones((), dtype=torch.float64)
+    for name, power in powers.items():
+        value = value * constants[name] ** power
+    return value
+
+
 def _combination(
-    model: Model, raw: Tensor, doubt: Uncertainty, combine: Callable[[Mapping], Tensor]
+    model: Model, raw: Tensor, doubt: Uncertainty, combine: Callable[[Mapping[str, Tensor]], Tensor]
 ) -> Estimate:
     """One combination, its interval by the slope of its value (delta method)."""
     guess = model.first()
@@ -151,13 +158,6 @@ def _combination(
     if v > 0 and reach < v:
         return Estimate(float(first), v, v * math.exp(-reach / v), v * math.exp(reach / v))
     return Estimate(float(first), v, v - reach, v + reach)
-
-
-def _product(constants: Mapping, powers: Mapping[str, float]) -> Tensor:
-    value = torch.ones((), dtype=torch.float64)
-    for name, power in powers.items():
-        value = value * constants[name] ** power
-    return value
 
 
 def product_name(powers: Mapping[str, float]) -> str:
@@ -189,13 +189,17 @@ def judge_actuator(
         if not doubt.touches(unit):
             low, high = (getattr(model.actuator(raw + sign * shift), part) for sign in (-1, 1))
             intervals["lag_s" if part == "lag" else part] = (low, high)
-    slew = float(path.slew)  # type: ignore[arg-type]
     return ActuatorEstimate(
-        delay_steps=float(path.delay_steps),  # type: ignore[arg-type]
-        lag_s=float(path.lag),  # type: ignore[arg-type]
-        slew=slew if math.isfinite(slew) else None,
-        dead_zone=float(path.dead_zone),  # type: ignore[arg-type]
-        gain_low=float(path.gain_low),  # type: ignore[arg-type]
+        delay_steps=_one(path.delay_steps),
+        lag_s=_one(path.lag),
+        slew=None if path.slew is None else _one(path.slew),
+        dead_zone=_one(path.dead_zone),
+        gain_low=_one(path.gain_low),
         intervals=intervals,
         tried=tried,
     )
+
+
+def _one(value: float | tuple[float, ...]) -> float:
+    """The number of all actions."""
+    return value[0] if isinstance(value, tuple) else value

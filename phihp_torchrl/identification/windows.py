@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -50,8 +51,7 @@ def gather(system: System, recordings: Sequence[Recording]) -> Samples:
         recordings: stretches of episodes, in the order of time.
 
     Raises:
-        ConfigError: for no recordings, other numbers of states or actions, a state that is measured
-            nowhere and is not the velocity of one that is, and infinite values.
+        ConfigError: for no recordings, other numbers of states or actions, and infinite values.
     """
     if not recordings:
         raise ConfigError("recordings", "expected one or more, got none.")
@@ -66,7 +66,9 @@ def gather(system: System, recordings: Sequence[Recording]) -> Samples:
         if recording.state.isinf().any():
             raise ConfigError("recordings", f"{recording.source}: expected finite states or NaN.")
     usual = torch.cat([r.intervals for r in recordings]).median()
-    interval, first, begun, offset = [], [], 0, 0
+    interval: list[Tensor] = []
+    first: list[Tensor] = []
+    begun, offset = 0, 0
     for i, r in enumerate(recordings):
         before = recordings[i - 1] if i else None
         goes_on = before is not None and _follows(before, r)
@@ -104,7 +106,7 @@ class Windows(NamedTuple):
         interval: seconds to the next sample, 0 in the padding, ``[W, L - 1]``.
     """
 
-    index: Tensor
+    index: Tensor  # type: ignore[assignment]
     measured: Tensor
     mask: Tensor
     time: Tensor
@@ -114,16 +116,13 @@ class Windows(NamedTuple):
         """Some of the windows, by their numbers or a mask of them."""
         return Windows(*(part[rows] for part in tuple(self)))
 
-    def __repr__(self) -> str:
-        return f"Windows({list(self.mask.shape)})"
-
 
 def runs(samples: Samples, usable: Tensor) -> list[tuple[int, int]]:
     """Where usable samples of one recording follow one another, as (begin, end)."""
     label = torch.where(usable, samples.stretch, -1)
     edges = (label.diff() != 0).nonzero().flatten() + 1
     cuts = [0, *edges.tolist(), len(label)]
-    return [(a, b) for a, b in zip(cuts[:-1], cuts[1:], strict=True) if label[a] >= 0]
+    return [(a, b) for a, b in pairwise(cuts) if label[a] >= 0]
 
 
 def cut(spans: Sequence[tuple[int, int]], length: int, least: int) -> list[tuple[int, int]]:
@@ -137,8 +136,7 @@ def cut(spans: Sequence[tuple[int, int]], length: int, least: int) -> list[tuple
     for begin, end in spans:
         count = -(-(end - begin) // length)
         edges = [begin + (end - begin) * i // count for i in range(count + 1)]
-        pairs = zip(edges[:-1], edges[1:], strict=True)
-        parts += [(a, b) for a, b in pairs if b - a >= least]
+        parts += [(a, b) for a, b in pairwise(edges) if b - a >= least]
     return parts
 
 
