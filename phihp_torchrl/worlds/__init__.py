@@ -1,4 +1,4 @@
-"""Worlds, the source of real steps: simulated, gymnasium's, any TorchRL environment, or recordings."""
+"""Worlds, the source of real steps: simulated, gymnasium's, TorchRL's, or recordings."""
 
 from __future__ import annotations
 

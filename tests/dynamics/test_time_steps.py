@@ -36,9 +36,7 @@ def test_the_time_step_of_the_task_is_the_default() -> None:
 
 @pytest.mark.parametrize("integrator", ["semi_implicit_euler", "rk4"])
 @pytest.mark.parametrize("method", ["levenberg_marquardt", "adam"])
-def test_a_fit_finds_what_can_be_known_under_an_irregular_clock(
-    integrator: str, method: str
-) -> None:
+def test_a_fit_takes_an_irregular_clock_as_it_is(integrator: str, method: str) -> None:
     truth = HybridDynamics.pure_prior(TASK, constants={"mass": 1.4}, integrator=integrator)
     model = HybridDynamics.pure_prior(TASK, integrator=integrator)
     rows = data(truth)
