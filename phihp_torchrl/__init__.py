@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from phihp_torchrl.evaluation import evaluate
     from phihp_torchrl.imagination import WorldModelEnv
     from phihp_torchrl.planners import CEMPlanner, MPPIPlanner, register_planner
-    from phihp_torchrl.systems import Constant, System
+    from phihp_torchrl.systems import Constant, LagrangianSystem, System
     from phihp_torchrl.tasks import Box, Task, get_task, register_task
     from phihp_torchrl.trainers import RunConfig, RunResult, register_phase, run
     from phihp_torchrl.worlds import Plant, World, make_world, register_plant, register_world
@@ -34,7 +34,7 @@ _HOMES = {
     "evaluation": ("evaluate",),
     "imagination": ("WorldModelEnv",),
     "planners": ("CEMPlanner", "MPPIPlanner", "register_planner"),
-    "systems": ("Constant", "System"),
+    "systems": ("Constant", "LagrangianSystem", "System"),
     "tasks": ("Actuator", "Box", "Task", "get_task", "register_task"),
     "trainers": ("RunConfig", "RunResult", "register_phase", "run"),
     "worlds": ("Plant", "World", "make_world", "register_plant", "register_world"),
@@ -50,6 +50,7 @@ __all__ = [
     "Constant",
     "DynamicsLoss",
     "HybridDynamics",
+    "LagrangianSystem",
     "Learned",
     "MPPIPlanner",
     "Plant",

@@ -15,6 +15,7 @@ from phihp_torchrl.agents.networks import (
 )
 from phihp_torchrl.agents.refit import CriticRefit, Refit, RefitConfig
 from phihp_torchrl.agents.replay import FlatReplay
+from phihp_torchrl.agents.scales import Scales, measure_scales, scaled, visited_states
 from phihp_torchrl.agents.td3 import TD3Config, TD3Update, learning_rate_scale, make_td3_loss
 
 __all__ = [

@@ -67,6 +67,8 @@ class HybridDynamics(nn.Module):
         self.prior = prior
         self.residual = residual
         self.integrator = make_integrator(integrator)
+        impulse = getattr(prior, "impulse", None)  # how a stop of one position acts on the others
+        self.layout = task.layout if impulse is None else task.layout.coupled(impulse)
 
     @classmethod
     def hybrid(
@@ -180,7 +182,7 @@ class HybridDynamics(nn.Module):
         """
         seconds = self.task.time_step if time_step is None else time_step
         return self.integrator(
-            lambda s: self.derivative(s, action), state, seconds, self.task.layout
+            lambda s: self.derivative(s, action), state, seconds, self.layout
         )
 
     def derivative(self, state: Tensor, action: Tensor) -> Tensor:

@@ -85,6 +85,11 @@ class PhysicsPrior(nn.Module):
         """F^p: ``[*batch, n], [*batch, m] -> [*batch, n]``."""
         return self.system.prior(state, action, self.constants())
 
+    def impulse(self, pair: int, state: Tensor) -> Tensor:
+        """How a stop changes all velocities: see :meth:`System.impulse`, by the pair's number."""
+        position = tuple(self.system.velocity_of)[pair]
+        return self.system.impulse(position, state, self.constants())
+
 
 def perturbed_constants(
     constants: Mapping[str, float], error: float, generator: torch.Generator | None = None

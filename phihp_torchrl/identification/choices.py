@@ -48,6 +48,7 @@ class Chooser:
         """Delay, lag, the other parts, and the integrator, in this order."""
         self.choose_delay()
         self.choose_lag()
+        self.choose_slew()
         self.choose_parts()
         self.choose_integrator()
 
@@ -99,11 +100,23 @@ class Chooser:
         free = {"delay_steps": delay, **({"lag": 0.0} if "lag" in model.fitted else {})}
         return replace(model, fitted=fitted, path=replace(model.path, **free))
 
+    def choose_slew(self) -> None:
+        """A limit of the rate, behind the delay, or instead of a lag that stands for it."""
+        rate = self._rate()
+        if self.config.slew != AUTO or not rate:
+            return
+        lagging = "lag" in self.best.model.fitted
+        for share in (0.3, 0.05):
+            model = self._with_delay(0.0 if lagging else self._delay())
+            trial = self._consider("slew", model.with_part("slew", share * rate))
+            if self._lower(trial) if lagging else self.trials.better(trial, self.best):
+                self.best, lagging = trial, False
+
     def choose_parts(self) -> None:
-        """Unequal gains, a dead zone and a limit of the rate."""
+        """Unequal gains and a dead zone."""
         action = self.trials.samples.action
         size = float(action.abs().max())
-        first = {"gain_low": 0.9, "dead_zone": 0.05 * size, "slew": 0.5 * self._rate()}
+        first = {"gain_low": 0.9, "dead_zone": 0.05 * size}
         for part, start in first.items():
             possible = start > 0 and (part != "gain_low" or bool((action < 0).any()))
             if getattr(self.config, part) != AUTO or not possible or not self._moves():

@@ -23,7 +23,7 @@ class IdentifyConfig:
         window: samples in a fitted window, whose start is free.
         windows: windows that are fitted at most, spread over the recordings.
         past: samples before a prediction, from which its start is estimated; where stretches are
-            short, a quarter of them has to do.
+            short, half of them has to do.
         horizons: steps ahead at which predictions are judged.
         delay: dead time of the actions in steps of the recordings, or ``"auto"``.
         largest_delay: the longest delay that is tried.
@@ -47,7 +47,7 @@ class IdentifyConfig:
 
     window: int = 40
     windows: int = 300
-    past: int = 100
+    past: int = 50
     horizons: tuple[int, ...] = (1, 5, 20)
     delay: float | Auto = AUTO
     largest_delay: int = 5

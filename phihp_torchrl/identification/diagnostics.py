@@ -30,6 +30,7 @@ _EXPLAINED = 0.1
 _WHITE = 0.3
 _JITTER = 0.02
 _OVER = 2.0
+_EXACT = 1e-5  # residuals below this share of the motion are those of the integrator
 
 
 def of_constants(constants: Mapping[str, Estimate]) -> list[Finding]:
@@ -125,7 +126,8 @@ def of_residuals(
     steps = torch.arange(1, BEFORE + 1)
     for i, name in enumerate(system.state_names):
         mask = windows.mask[..., i]
-        if not mask.any():
+        moved = windows.measured[..., i][mask]
+        if not len(moved) or float(fit.sigma[i]) < _EXACT * float(moved.std()):
             continue
         r = fit.residual[..., i] / fit.sigma[i]
         r = torch.where(mask, r.clamp(-5.0, 5.0), 0.0)
@@ -201,7 +203,7 @@ def _residuals(
         time=samples.time[index].tolist(),
         residual={
             n: [v if v == v else None for v in residual[:, i].tolist()]
-            for i, n in enumerate(names) if n in white
+            for i, n in enumerate(names) if windows.mask[..., i].any()
         },
         state={n: fit.states[real][:, i].tolist() for i, n in enumerate(names)},
         action={n: samples.action[index, i].tolist() for i, n in enumerate(actions)},

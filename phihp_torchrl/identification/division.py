@@ -57,7 +57,7 @@ def divide(system: System, samples: Samples, stops: Stops, config: IdentifyConfi
     kept, past = inside, LEAST
     held: list[Span] = []
     horizons: list[int] = []
-    for least in (config.past // 4, LEAST):  # a short past only where there is no longer one
+    for least in (config.past // 2, LEAST):  # a short past only where there is no longer one
         able = [h for h in config.horizons if h + least <= longest]
         if able and not held:
             past, horizons = least, able

@@ -28,7 +28,7 @@ _PICTURES = 6
 """Predictions of which the samples are kept."""
 _AT_STOPS = 40
 """Stretches at stops that are predicted."""
-_STRIDE = 10
+_STRIDE = 5
 """Samples from one prediction to the next."""
 
 

@@ -16,11 +16,14 @@ Stops = dict[str, tuple[float, float]]
 
 _BAND = 5.0
 """Standard deviations of the noise within which a position counts as at the stop."""
-_PILE = 5.0
+_PILE = 3.0
 """How much denser samples lie at a stop than beside it."""
-_LEAST = 10
+_LEAST = 5
 """Samples at a stop, from which on there is one."""
 _VISITS = 3
+"""Visits to a stop; twice as many that all turn at the same place make one suspect by itself."""
+_NARROW = 0.03
+"""Share of the range that the same place is narrower than."""
 
 
 def noise_level(samples: Samples) -> Tensor:
@@ -64,7 +67,8 @@ def suspect_stops(system: System, samples: Samples) -> Stops:
     """Where samples pile up at the end of a position's range, as they do at a stop.
 
     A motion that turns by itself spends time there too, but no more than a few times that beside
-    it. Whether the equations fail there, only a fit can tell.
+    it, and seldom turns at the same place again. Whether the equations fail there, only a fit can
+    tell.
     """
     found: Stops = {}
     level = noise_level(samples)
@@ -91,7 +95,9 @@ def _pile(column: Tensor, samples: Samples, level: float) -> float | None:
     beside = ((known > top - 3.0 * band) & (known <= top - band)).sum() / 2.0
     count = int(at_top.sum())
     visits = int((at_top.diff().to(torch.int) != 0).sum()) // 2
-    if count < _LEAST or visits < _VISITS or count < _PILE * float(beside):
+    piled = count >= _PILE * float(beside)
+    returns = visits >= 2 * _VISITS and band < _NARROW * float(top - known.min())
+    if count < _LEAST or visits < _VISITS or not (piled or returns):
         return None
     return float(column[at_top].median())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
@@ -17,11 +17,17 @@ Derivative = Callable[[Tensor], Tensor]
 """A vector field ``state [*batch, n] -> ds/dt [*batch, n]``, for an action that is held."""
 TimeStep = float | Tensor
 """Seconds: a number, or a tensor ``[*batch, 1]``."""
+Impulse = Callable[[int, Tensor], Tensor]
+"""``pair, state [*batch, n] -> [*batch, n]``: how the velocities change, per change of that one."""
 
 
 @dataclass(frozen=True)
 class StateLayout:
-    """Which components of a state are positions and velocities, and the limits of the velocities.
+    """Which components of a state are positions and velocities, and the limits of both.
+
+    A limit of a velocity holds it back. A limit of a position is a stop: after a solver step that
+    ends beyond it, the position is put on the limit, and a velocity that leads further out becomes
+    ``-restitution`` times itself. Several stops that are hit in one step act one after the other.
 
     Args:
         size: number of state components, ``n``.
@@ -29,20 +35,32 @@ class StateLayout:
         limits: one entry per pair, in the unit of the velocity: the largest ``|velocity|`` (``inf``
             for no limit), or the lowest and the highest velocity. The attribute always holds
             (lowest, highest).
+        stops: one entry per pair, in the unit of the position: the lowest and the highest position
+            (infinite for no stop). Empty for no stops at all.
+        restitution: one entry per pair, in [0, 1]: the share of the velocity that a stop gives
+            back. Empty for 0, stops without a bounce.
+        impulse: how a stop of one pair changes all velocities, as :meth:`coupled` sets it;
+            ``None`` if it changes the pair's own alone.
 
     Raises:
-        ConfigError: if there are not as many limits as pairs, or a lower limit is not below the
-            upper one.
+        ConfigError: if there are not as many limits as pairs, a lower limit is not below the
+            upper one, or a restitution is out of range.
 
     Examples:
         >>> layout = StateLayout(size=2, pairs=((0, 1),), limits=(8.0,))
         >>> layout.limited, layout.limits
         (True, ((-8.0, 8.0),))
+        >>> rail = StateLayout(2, ((0, 1),), (8.0,), stops=((-1.0, 1.0),), restitution=(0.5,))
+        >>> rail.clip(torch.tensor([1.2, 3.0]))
+        tensor([ 1.0000, -1.5000])
     """
 
     size: int
     pairs: tuple[tuple[int, int], ...] = ()
     limits: tuple[Any, ...] = ()
+    stops: tuple[tuple[float, float], ...] = ()
+    restitution: tuple[float, ...] = ()
+    impulse: Impulse | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if len(self.limits) != len(self.pairs):
@@ -55,14 +73,65 @@ class StateLayout:
         if any(len(pair) != 2 or not pair[0] < pair[1] for pair in limits):
             raise ConfigError("limits", f"expected low < high for each velocity, got {limits}.")
         object.__setattr__(self, "limits", limits)
+        stops = self.stops or ((-math.inf, math.inf),) * len(self.pairs)
+        bounce = self.restitution or (0.0,) * len(self.pairs)
+        for name, values in (("stops", stops), ("restitution", bounce)):
+            if len(values) != len(self.pairs):
+                raise ConfigError(
+                    name, f"expected one per pair, {len(self.pairs)}, got {len(values)}."
+                )
+        if any(len(pair) != 2 or not pair[0] < pair[1] for pair in stops):
+            raise ConfigError("stops", f"expected low < high for each position, got {stops}.")
+        if not all(0 <= value <= 1 for value in bounce):
+            raise ConfigError("restitution", f"expected values in [0, 1], got {bounce}.")
+        object.__setattr__(self, "stops", tuple((float(low), float(high)) for low, high in stops))
+        object.__setattr__(self, "restitution", tuple(float(value) for value in bounce))
 
     @property
     def limited(self) -> bool:
         """Whether any velocity has a finite limit."""
         return any(math.isfinite(bound) for pair in self.limits for bound in pair)
 
+    @property
+    def stopped(self) -> bool:
+        """Whether any position has a finite limit."""
+        return any(math.isfinite(bound) for pair in self.stops for bound in pair)
+
+    def coupled(self, impulse: Impulse) -> StateLayout:
+        """Return this layout with stops that change other velocities too; itself without stops.
+
+        Args:
+            impulse: ``pair, state [*batch, n] -> [*batch, n]``, the change of each component when
+                the velocity of that pair changes by 1.
+        """
+        return replace(self, impulse=impulse) if self.stopped else self
+
     def clip(self, state: Tensor) -> Tensor:
-        """Clip the velocities of ``state`` ``[*batch, n]`` to their limits."""
+        """Apply all limits to ``state`` ``[*batch, n]``: of the velocities, then of positions."""
+        return self.stop(self._clip_velocities(state))
+
+    def stop(self, state: Tensor) -> Tensor:
+        """Apply the limits of positions to ``state`` ``[*batch, n]``."""
+        if not self.stopped:
+            return state
+        for pair, (low, high) in enumerate(self.stops):
+            if not (math.isfinite(low) or math.isfinite(high)):
+                continue
+            q, v = self.pairs[pair]
+            columns = list(state.unbind(-1))
+            position, velocity = columns[q], columns[v]
+            hit = ((position > high) & (velocity > 0)) | ((position < low) & (velocity < 0))
+            after = torch.where(hit, -self.restitution[pair] * velocity, velocity)
+            columns[q] = position.clamp(low, high)
+            if self.impulse is not None:
+                along = self.impulse(pair, torch.stack(columns, -1)).unbind(-1)
+                for _, other in self.pairs:
+                    columns[other] = columns[other] + (after - velocity) * along[other]
+            columns[v] = after
+            state = torch.stack(columns, -1)
+        return self._clip_velocities(state)
+
+    def _clip_velocities(self, state: Tensor) -> Tensor:
         if not self.limited:
             return state
         components = list(state.unbind(-1))

@@ -14,8 +14,8 @@ class Dopri5(Integrator):
     """Adaptive Dormand-Prince solver of order 5, for reference results rather than for speed.
 
     It chooses its inner steps by the largest error in the batch, so results depend on the rest of
-    the batch, within the tolerances, and it does not compile as one graph. Velocity limits are
-    applied after the control step.
+    the batch, within the tolerances, and it does not compile as one graph. Limits of
+    velocities and of positions are applied after the control step.
 
     Inner steps are never shorter than a hundredth of the control step: dry friction jumps where a
     velocity changes sign, and a cart that sticks there would need a hundred thousand inner steps.

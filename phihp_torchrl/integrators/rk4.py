@@ -8,7 +8,7 @@ from phihp_torchrl.integrators.base import Derivative, FixedStepIntegrator, Stat
 
 
 class RK4(FixedStepIntegrator):
-    r"""Classical Runge-Kutta method of order 4; velocity limits are applied after each step.
+    r"""Classical Runge-Kutta method of order 4; limits are applied after each step.
 
     .. math:: s' = s + \tfrac{\Delta t}{6} (k_1 + 2 k_2 + 2 k_3 + k_4)
 

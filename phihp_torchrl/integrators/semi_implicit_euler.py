@@ -19,7 +19,7 @@ class SemiImplicitEuler(FixedStepIntegrator):
 
     With the kinematics :math:`f_q = v` this is the textbook scheme. In this form it needs one
     evaluation of ``f``, and holds over the step whatever a model adds to :math:`f_q`. Components
-    without a velocity take an explicit Euler step.
+    without a velocity take an explicit Euler step. Stops act after each step.
 
     Args:
         substeps: solver steps in a control step.
@@ -45,4 +45,4 @@ class SemiImplicitEuler(FixedStepIntegrator):
             if math.isfinite(low) or math.isfinite(high):
                 new[v] = new[v].clamp(low, high)
             new[q] = old[q] + time_step * (rate[q] + new[v] - old[v])
-        return torch.stack(new, -1)
+        return layout.stop(torch.stack(new, -1))

@@ -53,6 +53,15 @@ class Acrobot(System):
         alpha1, alpha2 = solve_inertia(theta2, rest1, rest2, c)
         return torch.stack([omega1, omega2, alpha1, alpha2], -1)
 
+    def impulse(self, position: str, state: Tensor, constants: Constants) -> Tensor:
+        """A stop of one joint swings the other link."""
+        one, zero = torch.ones_like(state[..., 0]), torch.zeros_like(state[..., 0])
+        first = position == "theta1"
+        blow = (one, zero) if first else (zero, one)
+        change = solve_inertia(state[..., 1], *blow, self.identifiable(constants))
+        own = change[0] if first else change[1]
+        return torch.stack([zero, zero, change[0] / own, change[1] / own], -1)
+
     def torques(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Torques on both joints for an action ``[*batch, m]``."""
         return action[..., 0], action[..., 1]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.integrators import StateLayout
+from phihp_torchrl.systems.layout import make_layout
 
 Constants = Mapping[str, Any]
 """Physical constants by name: floats, or tensors that broadcast against ``[*batch]``."""
@@ -147,6 +148,25 @@ class System:
         """
         raise NotImplementedError(f"{type(self).__name__}: this system has no prior.")
 
+    def impulse(self, position: str, state: Tensor, constants: Constants) -> Tensor:
+        """How a stop of one position changes all velocities, per change of that position's own.
+
+        A cart that a wall stops passes a blow to the pole on it. This is the direction of that
+        change, a column of the inverse mass matrix scaled to 1 in the velocity of ``position``.
+
+        Args:
+            position: name of the position that is stopped.
+            state: states ``[*batch, n]``, with the position on its limit.
+            constants: current values of the constants, by name.
+
+        Returns:
+            The change of each component of the state, ``[*batch, n]``. By default a stop changes
+            the position's own velocity alone.
+        """
+        own = self.state_names.index(self.velocity_of[position])
+        zero, one = torch.zeros_like(state[..., 0]), torch.ones_like(state[..., 0])
+        return torch.stack([one if i == own else zero for i in range(self.state_dim)], -1)
+
     def identifiable(self, constants: Constants) -> dict[str, Any]:
         """The combinations of constants that the motion determines; by default each constant."""
         return dict(constants)
@@ -179,27 +199,26 @@ class System:
         return tuple(self.state_names.index(name) for name in self.velocity_of.values())
 
     def layout(
-        self, velocity_limits: Mapping[str, float | tuple[float, float]] | None = None
+        self,
+        velocity_limits: Mapping[str, float | tuple[float, float]] | None = None,
+        position_limits: Mapping[str, tuple[float, float]] | None = None,
+        restitution: float | Mapping[str, float] = 0.0,
     ) -> StateLayout:
         """Return the layout of the state for an integrator.
 
         Args:
             velocity_limits: limits by the velocity's name: the largest ``|velocity|``, or the
                 lowest and the highest velocity.
+            position_limits: stops by the position's name: the lowest and the highest position.
+            restitution: the share of its velocity with which a position leaves a stop, in [0, 1];
+                one number for all, or by the position's name.
 
         Raises:
-            ConfigError: for a name that is not a velocity, and for limits in the wrong order.
+            ConfigError: for a name that is not a velocity or a position with stops, for limits in
+                the wrong order, and for stops of an angle beyond half a turn, where an observation
+                does not tell on which side of a stop it is.
         """
-        names = list(self.velocity_of.values())
-        given = dict(velocity_limits or {})
-        if unknown := sorted(set(given) - set(names)):
-            raise ConfigError("velocity_limits", f"unknown {unknown}, expected some of {names}.")
-        index = self.state_names.index
-        return StateLayout(
-            size=self.state_dim,
-            pairs=tuple((index(q), index(v)) for q, v in self.velocity_of.items()),
-            limits=tuple(given.get(name, math.inf) for name in names),
-        )
+        return make_layout(self, velocity_limits or {}, position_limits or {}, restitution)
 
     def observe(self, state: Tensor) -> Tensor:
         """Map a state ``[*batch, n]`` to an observation ``[*batch, o]``: angles as (cos, sin)."""

@@ -42,6 +42,15 @@ class CartPole(System):
         )
         return torch.stack([x_dot, x_ddot, theta_dot, theta_ddot], -1)
 
+    def impulse(self, position: str, state: Tensor, constants: Constants) -> Tensor:
+        """A stop of the cart swings the pole, and a stop of the pole drags the cart."""
+        m_p, l = constants["pole_mass"], constants["half_length"]
+        cos = state[..., 2].cos()
+        one, zero = torch.ones_like(cos), torch.zeros_like(cos)
+        if position == "x":
+            return torch.stack([zero, one, zero, -0.75 * cos / l], -1)
+        return torch.stack([zero, -m_p * l * cos / (constants["cart_mass"] + m_p), zero, one], -1)
+
 
 def accelerations(
     theta: Tensor, force: Tensor, pull: Tensor, constants: Constants

@@ -65,6 +65,9 @@ class Task:
         terminated: whether the next state ends the episode; ``None`` if episodes never terminate.
         velocity_limits: by name of the velocity, the largest ``|velocity|``, or the lowest and the
             highest velocity; velocities without an entry are not limited.
+        position_limits: stops by name of the position: the lowest and the highest position.
+        restitution: the share of its velocity with which a position leaves a stop, in [0, 1]; one
+            number, or by name of the position.
         coverage: wide box around the states that the task visits, from which imagined episodes
             start as well; ``None`` for no such box.
         goal: box around the goal, from which imagined episodes start as well; useful where the goal
@@ -100,6 +103,8 @@ class Task:
     velocity_limits: Mapping[str, float | tuple[float, float]] = field(
         default_factory=dict, hash=False
     )
+    position_limits: Mapping[str, tuple[float, float]] = field(default_factory=dict, hash=False)
+    restitution: float | Mapping[str, float] = field(default=0.0, hash=False)
     coverage: Box | None = None
     goal: Box | None = None
     exploration_reward: RewardFn | None = None
@@ -124,7 +129,9 @@ class Task:
         if self.actuator is not None:
             self.actuator.check(self.system.action_names)
         object.__setattr__(self, "velocity_limits", dict(self.velocity_limits))
-        object.__setattr__(self, "layout", self.system.layout(self.velocity_limits))
+        object.__setattr__(self, "position_limits", dict(self.position_limits))
+        layout = self.system.layout(self.velocity_limits, self.position_limits, self.restitution)
+        object.__setattr__(self, "layout", layout)
 
     def _set_bounds(self) -> None:
         names = self.system.action_names

@@ -5,6 +5,7 @@ from __future__ import annotations
 from phihp_torchrl.trainers.collect import CollectConfig, Policy, planning_policy, random_policy
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.evaluate import EvaluateConfig, EvaluatePhase
+from phihp_torchrl.trainers.exploration import Exploration, ExplorationConfig
 from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
 from phihp_torchrl.trainers.model import ModelConfig, ModelTrainer, make_dynamics
 from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_phase

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,6 +13,7 @@ from phihp_torchrl.config import ConfigError, check_count, check_not_negative
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.planners import CEMConfig, make_planner
 from phihp_torchrl.tasks import Task
+from phihp_torchrl.trainers.exploration import Exploration, ExplorationConfig
 
 _log = logging.getLogger(__name__)
 
@@ -37,6 +38,8 @@ class CollectConfig:
         random_hold: steps for which a random action is held in the first iteration, so that slow
             systems move.
         exploration_reward: whether to plan for the task's exploration reward, if it has one.
+        exploration: how far and how fast actions may go, and where an episode ends to protect a
+            plant.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.
@@ -54,10 +57,17 @@ class CollectConfig:
     noise: float = 0.3
     random_hold: int = 1
     exploration_reward: bool = True
+    exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
 
     def __post_init__(self) -> None:
         check_not_negative(self, "noise")
         check_count(self, "random_hold")
+        if self.random_hold > 1 and self.exploration.coloured:
+            raise ConfigError(
+                "random_hold",
+                "expected 1 with exploration.bandwidth or exploration.colour, which set how slow "
+                f"random actions are, got {self.random_hold}.",
+            )
         self.planner()  # refuses what the planner would refuse after real steps
 
     def planner(self) -> CEMConfig:
@@ -73,17 +83,37 @@ class CollectConfig:
         )
 
 
-def random_policy(task: Task, config: CollectConfig, generator: torch.Generator) -> Policy:
-    """Make a policy of uniform actions in bounds, each held for ``config.random_hold`` steps."""
+def random_policy(
+    task: Task,
+    config: CollectConfig,
+    generator: torch.Generator,
+    exploration: Exploration | None = None,
+) -> Policy:
+    """Make a policy of random actions in bounds, within the limits of ``config.exploration``.
+
+    They are uniform and held for ``config.random_hold`` steps each, or follow a coloured signal.
+
+    Args:
+        task: the task.
+        config: the settings.
+        generator: source of randomness.
+        exploration: the limits; by default those of ``config``.
+    """
     bounds = task.bounds
-    action, count = bounds.center, 0
+    explore = exploration or Exploration(task, config.exploration)
+    signal = explore.signal(generator) if explore.config.coloured else None
+    unit, count = bounds.center, 0
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
-        nonlocal count, action
-        if count % config.random_hold == 0:
-            action = bounds.from_unit(2.0 * torch.rand(action.shape, generator=generator) - 1.0)
+        nonlocal count, unit
+        if signal is not None:
+            unit = signal(tensordict)
+        elif count % config.random_hold == 0:
+            unit = 2.0 * torch.rand(unit.shape, generator=generator) - 1.0
         count += 1
-        return tensordict.set("action", action.clone())
+        limited = explore.config.limits
+        action = explore.around(tensordict, unit) if limited else bounds.from_unit(unit)
+        return tensordict.set("action", action)
 
     return policy
 
@@ -146,11 +176,24 @@ def planning_policy(
     config: CollectConfig,
     generator: torch.Generator,
     noise: float,
+    exploration: Exploration | None = None,
 ) -> Policy:
-    """Make a policy that plans by CEM in the model, with noise in units of the half-range."""
+    """Make a policy that plans by CEM in the model, within the limits of ``config.exploration``.
+
+    Args:
+        task: the task.
+        dynamics: the model.
+        config: the settings.
+        generator: source of randomness.
+        noise: std of the noise on planned actions, in units of the action's half-range.
+        exploration: the limits; by default those of ``config``.
+    """
+    explore = exploration or Exploration(task, config.exploration)
+    signal = explore.signal(generator, std=1.0) if explore.config.coloured else None
+    aim = explore.planning_task() if explore.config.limits else task
     if config.exploration_reward and task.exploration_reward is not None:
-        task = replace(task, reward=task.exploration_reward)
-    model = TaskWorldModel(task, dynamics)
+        aim = replace(aim, reward=task.exploration_reward)
+    model = TaskWorldModel(aim, dynamics)
     planner = make_planner(model, None, None, config.planner(), generator=generator)
     scale = noise * task.bounds.scale
 
@@ -159,7 +202,10 @@ def planning_policy(
             planner.reset()
         observed = TensorDict(observation=tensordict["observation"].float())
         action = planner(observed)["action"]
-        action = action + scale * torch.randn(scale.shape, generator=generator)
-        return tensordict.set("action", task.clip_action(action))
+        if signal is None:
+            action = action + scale * torch.randn(scale.shape, generator=generator)
+        else:
+            action = action + scale * signal(tensordict)
+        return tensordict.set("action", explore.limit(tensordict, task.clip_action(action)))
 
     return policy

@@ -12,11 +12,14 @@ from typing import Any, NamedTuple
 from phihp_torchrl.config import check_count
 from phihp_torchrl.deployment import Agent, save_agent
 from phihp_torchrl.evaluation import evaluate, measure_latency, show_episode
+from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
-from phihp_torchrl.worlds import World
+from phihp_torchrl.worlds import GuardedWorld, World, crossings_text
+
+_log = logging.getLogger(__name__)
 
 _log = logging.getLogger(__name__)
 
@@ -133,6 +136,15 @@ class EvaluatePhase:
     def _evaluate(self, name: str, agent: Agent) -> dict[str, float]:
         settings, task = self.settings, self.agent.task
         played = evaluate(agent, task, episodes=settings.episodes, world=self.world)
+        if isinstance(self.world, GuardedWorld) and self.world.crossings:
+            text = crossings_text(self.world.crossings)
+            self.world.crossings.clear()
+            _log.warning(
+                "Guards ended episodes of the agent's %s, whose returns are therefore too short: "
+                "%s. The reward should keep it from where the guards are.",
+                name,
+                text,
+            )
         summary = played.summary()
         if settings.latency_actions:
             summary |= measure_latency(agent, task, calls=settings.latency_actions).summary()
@@ -174,8 +186,12 @@ def _build(context: Context) -> Phase:
     config, agent = context.config, parts.get("agent")
     if agent is None:
         agent = Agent(context.task, **parts, planner_config=config.planner, compile=config.compile)
-    samples = real_steps(context.before)
-    return EvaluatePhase(agent, config, context.settings, context.world, context.directory, samples)
+    world, samples = context.world, real_steps(context.before)
+    collect = getattr(config.sections.get("model"), "collect", None)
+    guards = collect.exploration.guards if isinstance(collect, CollectConfig) else {}
+    if guards and world.truth is None:  # a simulated world is played as a model, which needs none
+        world = GuardedWorld(world, guards)
+    return EvaluatePhase(agent, config, context.settings, world, context.directory, samples)
 
 
 register_phase("evaluate", EvaluateConfig, _build, unit="parts")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -43,8 +44,16 @@ from phihp_torchrl.trainers.collect import (
     steady,
 )
 from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.exploration import Exploration
 from phihp_torchrl.trainers.phases import Phase, register_phase
-from phihp_torchrl.worlds import SimulatedWorld, World, disagreements, make_world
+from phihp_torchrl.worlds import (
+    SimulatedWorld,
+    World,
+    crossings_text,
+    disagreements,
+    guard_env,
+    make_world,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -230,7 +239,14 @@ class ModelTrainer:
         self.task = task
         self.config = config
         self.world = make_world(task, world)
-        self.env = self.world.make_env() if self.world.has_env else None
+        self.exploration = Exploration(task, config.collect.exploration)
+        self.crossings: Counter[str] = Counter()
+        guards = config.collect.exploration.guards
+        self.env = (
+            guard_env(self.world.make_env(), task, guards, self.crossings)
+            if self.world.has_env
+            else None
+        )
         self.recorded = _recorded(self.world)
         self.generator = torch.Generator().manual_seed(seed)
         self.dynamics = make_dynamics(self.world, config, self.generator)
@@ -304,6 +320,8 @@ class ModelTrainer:
         metrics = {"real_steps": self.real_steps, "collect/reward": reward}
         if self._dropped:
             metrics["collect/dropped"] = self._dropped
+        if self.config.collect.exploration.guards:
+            metrics["collect/guard_crossings"] = self.crossings.total()
         if self.config.kind != "oracle":
             metrics |= self.fit()
         self._new = 0
@@ -319,17 +337,20 @@ class ModelTrainer:
             raise ConfigError("world", f"{self.world} has recordings alone, nobody can act in it.")
         config, generator = self.config, self.generator
         if self.iteration == 0:
-            policy = random_policy(self.task, config.collect, generator)
+            policy = random_policy(self.task, config.collect, generator, self.exploration)
         else:
             fade = max(0.0, 1.0 - (self.iteration - 1) / max(1, config.iterations - 2))
+            noise = fade * config.collect.noise
             policy = planning_policy(
-                self.task, self.dynamics, config.collect, generator, fade * config.collect.noise
+                self.task, self.dynamics, config.collect, generator, noise, self.exploration
             )
         # Each iteration has its seed, so that a resumed run has the same resets.
         self.env.set_seed(self._draw_seed())
+        self.crossings.clear()
         with torch.no_grad():
             policy = steady(self.task, policy)
             rollout = self.env.rollout(steps, policy, break_when_any_done=False)
+        self._tell_crossings(steps)
         done = rollout["next", "done"].clone()
         done[-1] = True  # the next rollout starts from a reset
         data = TensorDict(
@@ -347,6 +368,18 @@ class ModelTrainer:
         data, dropped = drop_unusable(data)
         self._dropped += dropped
         return data
+
+    def _tell_crossings(self, steps: int) -> None:
+        """Warn where guards ended episodes."""
+        if self.crossings:
+            _log.warning(
+                "Guards ended %d episodes in %d real steps (%s). If the plant should not come near "
+                "them, lower model.collect.exploration.amplitude or rate, or explore around a "
+                "controller (model.collect.exploration.controller).",
+                self.crossings.total(),
+                steps,
+                crossings_text(self.crossings),
+            )
 
     def _tell_disagreements(self) -> None:
         """Warn where real transitions contradict the task, when first seen and at the end."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Mapping
@@ -16,14 +17,19 @@ from phihp_torchrl.agents import (
     CriticRefit,
     FlatReplay,
     RefitConfig,
+    Scales,
     TD3Config,
     act,
     copy_actor,
     copy_twin_qvalue,
     learning_rate_scale,
+    measure_scales,
+    scaled,
+    visited_states,
 )
 from phihp_torchrl.config import (
     ConfigError,
+    check_choice,
     check_count,
     check_not_negative,
     check_positive,
@@ -36,6 +42,8 @@ from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, register_phase
 from phihp_torchrl.trainers.td3_base import TD3Trainer
 from phihp_torchrl.worlds import World
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -61,6 +69,8 @@ class PolicyConfig:
         real_evaluation_episodes: episodes of the actor in a simulated world at each evaluation,
             which are logged and not used for training; 0 for none.
         max_seconds: duration after which the phase ends early; null for no limit.
+        scales: auto to train in units measured from the task's coverage, where observations or
+            values are far from the size of one; none to train in physical units.
         start: where imagined episodes start.
         td3: hyper-parameters of TD3.
         refit: when and how the critics are fitted to the best actor's returns in the model.
@@ -91,6 +101,7 @@ class PolicyConfig:
     evaluation_steps: int | None = None
     real_evaluation_episodes: int = 10
     max_seconds: float | None = None
+    scales: str = "auto"
     start: StartConfig = field(default_factory=StartConfig)
     td3: TD3Config = field(default_factory=TD3Config)
     refit: RefitConfig = field(default_factory=RefitConfig)
@@ -107,6 +118,7 @@ class PolicyConfig:
             "evaluation_interval",
             "evaluation_episodes",
         )
+        check_choice(self, "scales", ("auto", "none"))
         check_share(self, "random_fraction", "decay")
         check_count(self, "random_steps", "real_evaluation_episodes", least=0)
         check_not_negative(self, "exploration_noise")
@@ -151,6 +163,9 @@ class PolicyTrainer(TD3Trainer):
     its returns in the model, and training continues from these. The last fit gives the critics that
     the planner uses.
 
+    With ``config.scales`` the networks are trained in units that are measured from the task's
+    coverage. The actors and critics that this returns, and its metrics, are in physical units.
+
     Args:
         task: the task.
         dynamics: the model to imagine with; it is not changed.
@@ -188,10 +203,12 @@ class PolicyTrainer(TD3Trainer):
         data_states: Tensor | None = None,
         compile: bool = False,
     ) -> None:
-        self.world_model = TaskWorldModel(task, dynamics)
-        super().__init__(self.world_model, config.td3, seed=seed, compile=compile)
-        self.config = config
+        self.task, self.config = task, config
         self.start_states = make_start_states(task, config.start, states=data_states)
+        model = TaskWorldModel(task, dynamics)
+        self.scales = self._measure(model, seed)
+        self.world_model = scaled(model, self.scales)
+        super().__init__(self.world_model, config.td3, seed=seed, compile=compile)
         self.rollouts = Rollouts(self.world_model, act, self.max_age, compile=compile)
         self.refit = CriticRefit(
             self.world_model, self.rollouts, config.refit, config.td3.gamma, compile=compile
@@ -202,7 +219,10 @@ class PolicyTrainer(TD3Trainer):
         self.best_return = -math.inf
         self._evaluation_states = task.sample_start([config.evaluation_episodes], self.generator)
         truth = None if world is None else world.model()
-        self._real = None if truth is None else Rollouts(truth, act, self.max_age, compile=compile)
+        self._real = None
+        if truth is not None:
+            world_model = scaled(truth, self.scales)
+            self._real = Rollouts(world_model, act, self.max_age, compile=compile)
         # The world's episodes have a generator of their own: the log has no part in the training.
         self._world_states = task.sample_start(
             [config.real_evaluation_episodes], torch.Generator().manual_seed(seed)
@@ -251,7 +271,7 @@ class PolicyTrainer(TD3Trainer):
             "policy/imagined_steps": float(self.replay.written),
             "policy/imagined_return": imagined,
             "policy/best_imagined_return": self.best_return,
-            **{f"policy/{name}": value.item() for name, value in losses.items()},
+            **{f"policy/{name}": self._unit(name) * loss.item() for name, loss in losses.items()},
         }
         if config.refit.is_due(self.updates, config.updates):
             metrics |= self._refit_critics()
@@ -262,15 +282,16 @@ class PolicyTrainer(TD3Trainer):
 
     def actor(self) -> TensorDictModule:
         """The actor as it is now."""
-        return copy_actor(self.task, self.update.actor)
+        return copy_actor(self.task, self.scales.actor(self.update.actor))
 
     def best_actor(self) -> TensorDictModule:
         """The actor with the best imagined return so far."""
-        return copy_actor(self.task, self.best[: len(self.update.actor)])
+        return copy_actor(self.task, self.scales.actor(self.best[: len(self.update.actor)]))
 
     def best_qvalue(self) -> TensorDictModule:
         """The twin critics that were the best actor's."""
-        return copy_twin_qvalue(self.task, self.best[len(self.update.actor) :])
+        critics = self.best[len(self.update.actor) :]
+        return copy_twin_qvalue(self.task, self.scales.critics(critics))
 
     def parts(self) -> dict[str, Any]:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""
@@ -280,6 +301,7 @@ class PolicyTrainer(TD3Trainer):
         """Everything that a resumed run needs, tensors and numbers only."""
         return {
             **super().state_dict(),
+            "scales": vars(self.scales).copy(),
             "best": list(self.best),
             "best_return": self.best_return,
             "evaluation_states": self._evaluation_states,
@@ -287,7 +309,12 @@ class PolicyTrainer(TD3Trainer):
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a :meth:`state_dict`."""
+        """Continue from a :meth:`state_dict`.
+
+        Raises:
+            ConfigError: if that was trained in other units than those measured here.
+        """
+        self._check_scales(state.get("scales"))
         super().load_state_dict(state)
         for kept, layer in zip(self.best, state["best"], strict=True):
             kept.copy_(layer)
@@ -295,11 +322,50 @@ class PolicyTrainer(TD3Trainer):
         self._evaluation_states = state["evaluation_states"]
         self._world_states = state["world_states"]
 
+    def _measure(self, model: TaskWorldModel, seed: int) -> Scales:
+        """The units to train in; they have a generator of their own, which moves nothing else."""
+        task, config = self.task, self.config
+        if config.scales == "none":
+            size = task.observation_dim
+            return Scales(torch.zeros(size), torch.ones(size))
+        generator = torch.Generator().manual_seed(seed)
+        states = visited_states(model, self.start_states, min(self.max_age, 200), generator)
+        gamma = config.td3.gamma
+        horizon = self.max_age if gamma == 1 else min(self.max_age, 1 / (1 - gamma))
+        scales = measure_scales(model, states, horizon, generator)
+        if not scales.are_one:
+            _log.info(
+                "Networks read (observation - %s) / %s and learn rewards / %g.",
+                scales.center.tolist(),
+                scales.scale.tolist(),
+                scales.reward,
+            )
+        return scales
+
+    def _check_scales(self, saved: Mapping[str, Any] | None) -> None:
+        size = self.task.observation_dim
+        there = Scales(**saved) if saved else Scales(torch.zeros(size), torch.ones(size))
+        same = all(
+            torch.equal(torch.as_tensor(getattr(there, name)), torch.as_tensor(value))
+            for name, value in vars(self.scales).items()
+        )
+        if not same:
+            raise ConfigError(
+                "policy.scales",
+                f"expected networks trained in the units measured here, {self.scales}, got some "
+                f"trained in {there}; start phase 'policy' again, with policy.scales=none for "
+                "physical units.",
+            )
+
+    def _unit(self, name: str) -> float:
+        """The unit of a loss: critics' is squared."""
+        return self.scales.reward ** (2 if name == "loss_qvalue" else 1)
+
     def _play(self, world: Rollouts, states: Tensor) -> float:
         """Mean return of the noise-free actor; minus infinity where it left the finite numbers."""
         steps = self.config.evaluation_steps or self.task.max_steps
         score = world.returns(self.update.networks.actor, states, steps).total
-        return torch.nan_to_num(score, nan=-math.inf).mean().item()
+        return self.scales.reward * torch.nan_to_num(score, nan=-math.inf).mean().item()
 
     def _keep(self, layers: list[Tensor]) -> None:
         for kept, layer in zip(self.best, layers, strict=True):
@@ -314,9 +380,9 @@ class PolicyTrainer(TD3Trainer):
         self._keep([*actor, *refit.critics])
         self.update.restart(actor, refit.critics)
         return {
-            "policy/critic_lag": refit.lag,
-            "policy/critic_error_before": refit.error_before,
-            "policy/critic_error": refit.error_after,
+            "policy/critic_lag": self.scales.reward * refit.lag,
+            "policy/critic_error_before": self.scales.reward * refit.error_before,
+            "policy/critic_error": self.scales.reward * refit.error_after,
         }
 
     def _layers(self) -> list[Tensor]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import logging
+from collections import Counter
 from pathlib import Path
 
 import torch
@@ -10,11 +12,14 @@ from torch import Tensor
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.trainers.collect import CollectConfig, random_policy, steady
-from phihp_torchrl.worlds import World
+from phihp_torchrl.trainers.exploration import Exploration
+from phihp_torchrl.worlds import World, crossings_text, guard_env
+
+_log = logging.getLogger(__name__)
 
 
 def record(world: World, config: CollectConfig, steps: int, seed: int, path: Path) -> Path:
-    """Take real steps with the random policy of phase 1, and write them to a CSV file as they come.
+    """Take real steps with the exploration of phase 1, and write them to a CSV file as they come.
 
     The file has the columns ``time``, ``episode`` and one for each state and action of the task's
     system, so that ``world=recorded world.files=...`` reads it without further words. The last row
@@ -22,7 +27,7 @@ def record(world: World, config: CollectConfig, steps: int, seed: int, path: Pat
 
     Args:
         world: a world in which one can act.
-        config: the random policy.
+        config: the exploration, its limits and guards.
         steps: real steps in all.
         seed: of the world and of the policy.
         path: the file.
@@ -45,8 +50,10 @@ def record(world: World, config: CollectConfig, steps: int, seed: int, path: Pat
         raise ConfigError("world", f"{world} has recordings alone, nobody can act in it.")
     task = world.task
     generator = torch.Generator().manual_seed(seed)
-    policy = steady(task, random_policy(task, config, generator))
-    env = world.make_env()
+    exploration = Exploration(task, config.exploration)
+    policy = steady(task, random_policy(task, config, generator, exploration))
+    crossings: Counter[str] = Counter()
+    env = guard_env(world.make_env(), task, config.exploration.guards, crossings)
     env.set_seed(seed)
     path.parent.mkdir(parents=True, exist_ok=True)
     with torch.no_grad(), path.open("w", newline="") as file:
@@ -71,4 +78,6 @@ def record(world: World, config: CollectConfig, steps: int, seed: int, path: Pat
             episode += over
             if over:
                 file.flush()
+    if crossings:
+        _log.warning("Guards ended %d episodes: %s.", crossings.total(), crossings_text(crossings))
     return path

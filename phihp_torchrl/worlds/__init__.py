@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from phihp_torchrl.worlds.agreement import disagreements
 from phihp_torchrl.worlds.base import World
+from phihp_torchrl.worlds.guards import (
+    GuardedWorld,
+    crossings_text,
+    guard_env,
+    read_guards,
+)
 from phihp_torchrl.worlds.gymnasium import GymnasiumConfig, GymnasiumWorld
 from phihp_torchrl.worlds.recorded import RecordedConfig, RecordedWorld
 from phihp_torchrl.worlds.registry import (

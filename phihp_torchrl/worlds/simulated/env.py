@@ -59,6 +59,7 @@ class TaskEnv(gym.Env[Any, Any]):
             self.task = replace(self.task, actuator=actuator)
         self.plant = plant or find_plant(self.task.system)
         self.integrator = make_integrator(integrator or "semi_implicit_euler")
+        self.layout = self.task.layout.coupled(self.plant.impulse)
         modes = [None, *self.metadata["render_modes"]]
         if render_mode not in modes:
             raise ValueError(f"render_mode: expected one of {modes}, got {render_mode!r}.")
@@ -117,7 +118,7 @@ class TaskEnv(gym.Env[Any, Any]):
     def _move(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
         self.last_action = action.numpy()
         return self.integrator(
-            lambda s: self.plant.derivative(s, action), state, self.task.time_step, self.task.layout
+            lambda s: self.plant.derivative(s, action), state, self.task.time_step, self.layout
         )
 
     def _observe(self, state: torch.Tensor) -> NDArray[np.float32]:

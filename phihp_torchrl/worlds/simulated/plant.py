@@ -79,6 +79,11 @@ class Plant:
         """The true ds/dt: ``[*batch, n], [*batch, m] -> [*batch, n]``."""
         return self.system.prior(state, action, self.constants) + self.friction(state, action)
 
+    def impulse(self, pair: int, state: Tensor) -> Tensor:
+        """How a stop changes all velocities: see :meth:`System.impulse`, by the pair's number."""
+        position = tuple(self.system.velocity_of)[pair]
+        return self.system.impulse(position, state, self.constants)
+
 
 class PlantPhysics(nn.Module):
     """The true ds/dt as a module in the place of a prior, for the oracle's model.
@@ -110,6 +115,10 @@ class PlantPhysics(nn.Module):
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """ds/dt: ``[*batch, n], [*batch, m] -> [*batch, n]``."""
         return self.plant.derivative(state, action)
+
+    def impulse(self, pair: int, state: Tensor) -> Tensor:
+        """How a stop changes all velocities, as :meth:`Plant.impulse`."""
+        return self.plant.impulse(pair, state)
 
 
 PRIORS.register(PlantPhysics.kind, PlantPhysics)
