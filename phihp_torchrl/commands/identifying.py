@@ -30,7 +30,7 @@ from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.trainers import CollectConfig, new_run_directory, record, write_atomically
 from phihp_torchrl.worlds import WORLDS, RecordedConfig, World, make_world
 
-_COMPOSED = ("task", "world", "model", "plugins")
+SHARED = ("task", "world", "model", "plugins")
 """Words that a run has too, and that the settings of a task may change."""
 _OF_STEPS = ("world", "model", "steps", "seed", "out_dir")
 """Words that another fit of the same steps has no use for."""
@@ -55,7 +55,7 @@ def identify_as(job: IdentifyJob, words: Sequence[str], config_dir: str | None) 
     """
     torch.set_num_threads(job.threads)
     config = from_mapping(IdentifyConfig, job.identify, "identify")
-    shared = [word for word in words if _section(word) in _COMPOSED]
+    shared = [word for word in words if _section(word) in SHARED]
     settings = load_config(overrides=shared, config_dir=config_dir)
     task = find_task(job.task).with_actuator(settings["actuator"])
     if not task.system.has_prior:

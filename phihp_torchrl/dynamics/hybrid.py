@@ -181,9 +181,7 @@ class HybridDynamics(nn.Module):
                 the task.
         """
         seconds = self.task.time_step if time_step is None else time_step
-        return self.integrator(
-            lambda s: self.derivative(s, action), state, seconds, self.layout
-        )
+        return self.integrator(lambda s: self.derivative(s, action), state, seconds, self.layout)
 
     def derivative(self, state: Tensor, action: Tensor) -> Tensor:
         """ds/dt = F^p + F^r, ``[*batch, n]``."""

@@ -10,6 +10,9 @@ from phihp_torchrl.identification.result import Identification
 from phihp_torchrl.systems import Constant
 from phihp_torchrl.tasks import Actuator, Task
 
+_INSIDE = 1e-3
+"""How far inside its range a first guess stays, as a share of it: its limits are not allowed."""
+
 
 def ready_to_paste(task: Task, found: Identification) -> dict[str, str]:
     """Code with the fitted constants and the fitted actuator, by where it belongs.
@@ -64,6 +67,9 @@ def _constants(task: Task, found: Identification) -> Iterator[str]:
         if declared.fixed:
             value = f"Constant({value}, fixed=True)"
         elif declared.bounded:
+            room = _INSIDE * (declared.high - declared.low)
+            inside = min(max(c.estimate, declared.low + room), declared.high - room)
+            value = _rounded(inside)
             value = f"Constant({value}, low={declared.low:g}, high={declared.high:g})"
         known = c.verdict in (IDENTIFIED, FIXED)
         yield f'    "{name}": {value},' + ("" if known else f"  # {c.verdict}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -148,7 +149,7 @@ def _axis(
 def _ticks(axis: _Axis, count: int, whole: bool = False) -> list[tuple[float, str]]:
     values = MaxNLocator(nbins=count, integer=whole).tick_values(axis.low, axis.high)
     inside = [float(v) for v in values if axis.low <= v <= axis.high]
-    step = min((b - a for a, b in zip(inside, inside[1:], strict=False)), default=1.0)
+    step = min((b - a for a, b in itertools.pairwise(inside)), default=1.0)
     return [(v, f"{0.0 if abs(v) < 1e-6 * step else v:.6g}") for v in inside]
 
 
