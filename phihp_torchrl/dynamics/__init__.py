@@ -8,6 +8,7 @@ from phihp_torchrl.dynamics.hybrid import PRIORS, RESIDUAL_OUTPUTS, HybridDynami
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.dynamics.prior import PhysicsPrior, perturbed_constants
 from phihp_torchrl.dynamics.residual import ACTIVATIONS, ResidualMLP
+from phihp_torchrl.dynamics.solver_choice import AUTO, SOLVERS, fit_solver
 from phihp_torchrl.dynamics.world_model import TaskWorldModel
 
 __all__ = [
@@ -18,4 +19,5 @@ __all__ = [
     "ResidualMLP",
     "TaskWorldModel",
     "fit",
+    "fit_solver",
 ]

@@ -11,7 +11,12 @@ from torch import Tensor, nn
 from phihp_torchrl.config import ConfigError, Registry
 from phihp_torchrl.dynamics.prior import PhysicsPrior
 from phihp_torchrl.dynamics.residual import ResidualMLP
-from phihp_torchrl.integrators import Integrator, make_integrator
+from phihp_torchrl.integrators import (
+    Integrator,
+    integrator_mapping,
+    make_integrator,
+    read_integrator,
+)
 from phihp_torchrl.tasks import Task
 
 RESIDUAL_OUTPUTS = ("velocities", "all")
@@ -148,7 +153,7 @@ class HybridDynamics(nn.Module):
                 name: None if part is None else _config_of(name, part)
                 for name, part in parts.items()
             },
-            "integrator": {"name": self.integrator.name, **self.integrator.settings},
+            "integrator": integrator_mapping(self.integrator),
         }
 
     @classmethod
@@ -163,8 +168,7 @@ class HybridDynamics(nn.Module):
             prior = PRIORS.find(prior["kind"]).from_config(task.system, prior)
         if residual is not None:
             residual = ResidualMLP.from_config(task.system, residual)
-        integrator = dict(config["integrator"])
-        solver = make_integrator(integrator.pop("name"), **integrator)
+        solver = read_integrator(config["integrator"])
         return cls(task, prior=prior, residual=residual, integrator=solver)
 
     def forward(self, state: Tensor, action: Tensor, time_step: Tensor | None = None) -> Tensor:
@@ -175,10 +179,10 @@ class HybridDynamics(nn.Module):
         """The next state for what acts on the system, as :meth:`Task.transition` needs it.
 
         Args:
-            state: states ``[*batch, n]``.
-            action: what acts on the system, ``[*batch, m]``.
-            time_step: seconds for which each acts, ``[*batch, 1]``. Defaults to the time step of
-                the task.
+            state: states of the system ``[*batch, n]``.
+            action: what acts on it, ``[*batch, m]``.
+            time_step: seconds for which each action is held, ``[*batch, 1]``. Defaults to the time
+                step of the task.
         """
         seconds = self.task.time_step if time_step is None else time_step
         return self.integrator(lambda s: self.derivative(s, action), state, seconds, self.layout)
@@ -207,7 +211,7 @@ class HybridDynamics(nn.Module):
         Args:
             state: first state, ``[*batch, n]``.
             actions: what acts on the system in each step, ``[*batch, time, m]``.
-            time_step: seconds for which each acts, ``[*batch, time, 1]``. Defaults to the time
+            time_step: seconds for which each is held, ``[*batch, time, 1]``. Defaults to the time
                 step of the task.
 
         Returns:

@@ -15,10 +15,10 @@ from phihp_torchrl.config import ConfigError, check_count
 
 Derivative = Callable[[Tensor], Tensor]
 """A vector field ``state [*batch, n] -> ds/dt [*batch, n]``, for an action that is held."""
-TimeStep = float | Tensor
-"""Seconds: a number, or a tensor ``[*batch, 1]``."""
 Impulse = Callable[[int, Tensor], Tensor]
 """``pair, state [*batch, n] -> [*batch, n]``: how the velocities change, per change of that one."""
+TimeStep = float | Tensor
+"""Seconds: a number, or a tensor ``[*batch, 1]``."""
 
 
 @dataclass(frozen=True)
@@ -175,6 +175,10 @@ class Integrator(abc.ABC):
     def settings(self) -> dict[str, Any]:
         """The arguments that make an equal one: ``make_integrator(name, **settings)``."""
         return dict(vars(self))
+
+    def __str__(self) -> str:
+        told = ", ".join(f"{name} {value:g}" for name, value in self.settings.items())
+        return f"{self.name} ({told})" if told else self.name
 
 
 class FixedStepIntegrator(Integrator):

@@ -49,7 +49,11 @@ def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
     """
     _check(task, recordings)
     left: Counter[str] = Counter()
-    parts = [part for log in recordings if len(part := _of(task, log, left))]
+    parts = [
+        part
+        for log, before in zip(recordings, (None, *recordings), strict=False)
+        if len(part := _of(task, log, _goes_on(log, before), left))
+    ]
     for reason, count in left.items():
         _log.warning("%d recorded transitions are left out: %s.", count, reason)
     if not parts:
@@ -63,7 +67,11 @@ def observations(task: Task, recording: Recording) -> Tensor:
     This is the only place where a sample of a log becomes an observation: what a task adds to the
     physical state, from the commands so far, belongs here.
     """
-    return task.observe(recording.state)
+    if task.actuator is None:
+        return task.observe(recording.state)
+    held = torch.cat([recording.intervals, recording.intervals[-1:]])
+    _, registers = task.actuator.along(task.clip_action(recording.action), held)
+    return task.observe(torch.cat([recording.state, registers], -1))
 
 
 def _check(task: Task, recordings: Sequence[Recording]) -> None:
@@ -84,7 +92,15 @@ def _check(task: Task, recordings: Sequence[Recording]) -> None:
         )
 
 
-def _of(task: Task, log: Recording, left: Counter[str]) -> TensorDict:
+def _goes_on(log: Recording, before: Recording | None) -> bool:
+    """Whether a stretch starts in the middle of an episode."""
+    return (
+        before is not None and log.episode == before.episode and bool(log.time[0] > before.time[-1])
+    )
+
+
+def _of(task: Task, log: Recording, goes_on: bool, left: Counter[str]) -> TensorDict:
+    """The transitions of a stretch; one that goes on starts in the middle of an episode."""
     observation, action = observations(task, log), log.action[:-1]
     low = log.action.new_tensor(task.action_low or ())
     high = log.action.new_tensor(task.action_high)
@@ -93,6 +109,10 @@ def _of(task: Task, log: Recording, left: Counter[str]) -> TensorDict:
     known = observation.isfinite().all(-1)
     unknown = ~(known[:-1] & known[1:])
     left["a state is unknown before or after them"] += int(unknown.sum())
+    if goes_on and task.actuator is not None:
+        early = log.time[:-1] < log.time[0] + task.actuator.memory(task.time_step)
+        left["what was under way before their stretch is unknown"] += int((early & ~unknown).sum())
+        unknown |= early
     left[
         f"their commands are beyond the bounds of task {task.name!r}, {task.action_low} to "
         f"{task.action_high}; widen those in Task(action_low=..., action_high=...)"

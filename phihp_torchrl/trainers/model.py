@@ -21,19 +21,29 @@ from phihp_torchrl.config import (
     check_widths,
 )
 from phihp_torchrl.dynamics import (
+    AUTO,
     BLOCK,
     RESIDUAL_OUTPUTS,
+    SOLVERS,
     DynamicsLoss,
     FitConfig,
+    FitReport,
     HybridDynamics,
     PhysicsPrior,
     fit,
+    fit_solver,
     perturbed_constants,
     rollout_error,
     split,
 )
 from phihp_torchrl.imagination import Batch
-from phihp_torchrl.integrators import check_integrator, has_substeps, integrator_of
+from phihp_torchrl.integrators import (
+    check_integrator,
+    has_substeps,
+    integrator_mapping,
+    integrator_of,
+    read_integrator,
+)
 from phihp_torchrl.recordings import transitions
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.collect import (
@@ -80,8 +90,9 @@ class ModelConfig:
         activation: activation of the residual: relu, tanh or silu.
         residual_outputs: components that the residual corrects, velocities (accelerations only) or
             all (every component of ds/dt).
-        integrator: integrator of the model, semi_implicit_euler, rk4 or dopri5.
-        substeps: solver steps in a control step; 1 for dopri5, which chooses its steps.
+        integrator: integrator of the model, semi_implicit_euler, rk4 or dopri5; or auto, for the
+            cheapest one with fixed steps that predicts held-out transitions about as well as any.
+        substeps: solver steps in a control step; 1 for dopri5 and auto, which choose their steps.
         lambda_0: initial λ of the published loss, which divides the weight of ‖F^r‖.
         tau_ph: growth of λ with the prediction error.
         warm_start: whether a fit starts from the previous one. The fits between the first and the
@@ -106,7 +117,7 @@ class ModelConfig:
     hidden_sizes: tuple[int, ...] = (16, 16)
     activation: str = "tanh"
     residual_outputs: str = "velocities"
-    integrator: str = "semi_implicit_euler"
+    integrator: str = AUTO
     substeps: int = 1
     lambda_0: float = 1e3
     tau_ph: float = 1e3
@@ -123,7 +134,10 @@ class ModelConfig:
         check_count(self, "refit_steps")
         check_choice(self, "residual_outputs", RESIDUAL_OUTPUTS)
         check_choice(self, "activation", _ACTIVATIONS)
-        check_integrator(self)
+        if self.integrator != AUTO:
+            check_integrator(self)
+        elif self.substeps != 1:
+            raise ConfigError("substeps", f"expected 1 for {AUTO}, got {self.substeps}.")
         check_widths(self, "hidden_sizes")
         check_positive(self, "lambda_0")
         check_not_negative(self, "tau_ph")
@@ -132,7 +146,7 @@ class ModelConfig:
                 "constants_error",
                 f"expected a relative error in [0, 1), got {self.constants_error}.",
             )
-        chooses = not has_substeps(self.integrator)
+        chooses = self.integrator != AUTO and not has_substeps(self.integrator)
         if self.kind != "oracle" and self.fit.method != "adam" and chooses:
             raise ConfigError(
                 "fit.method",
@@ -173,7 +187,8 @@ def make_dynamics(
                 "model.kind", f"expected another than 'oracle': {world} has no truth to plan with."
             )
         return world.oracle()
-    integrator = integrator_of(config)
+    # The cheapest is the first that is tried (fit_solver).
+    integrator = SOLVERS[0] if config.integrator == AUTO else integrator_of(config)
     activation, sizes = _ACTIVATIONS[config.activation], config.hidden_sizes
     if config.kind == "data_driven":
         return HybridDynamics.data_driven(
@@ -241,12 +256,10 @@ class ModelTrainer:
         self.world = make_world(task, world)
         self.exploration = Exploration(task, config.collect.exploration)
         self.crossings: Counter[str] = Counter()
-        guards = config.collect.exploration.guards
-        self.env = (
-            guard_env(self.world.make_env(), task, guards, self.crossings)
-            if self.world.has_env
-            else None
-        )
+        self.env = None
+        if self.world.has_env:
+            guards = config.collect.exploration.guards
+            self.env = guard_env(self.world.make_env(), task, guards, self.crossings)
         self.recorded = _recorded(self.world)
         self.generator = torch.Generator().manual_seed(seed)
         self.dynamics = make_dynamics(self.world, config, self.generator)
@@ -318,10 +331,10 @@ class ModelTrainer:
         self._tell_disagreements()
         reward = self.data["next", "reward"][-self._new :].mean()
         metrics = {"real_steps": self.real_steps, "collect/reward": reward}
-        if self._dropped:
-            metrics["collect/dropped"] = self._dropped
         if self.config.collect.exploration.guards:
             metrics["collect/guard_crossings"] = self.crossings.total()
+        if self._dropped:
+            metrics["collect/dropped"] = self._dropped
         if self.config.kind != "oracle":
             metrics |= self.fit()
         self._new = 0
@@ -404,7 +417,7 @@ class ModelTrainer:
                 initial_lambda=config.final_lambda,
             )
         train, held_out, blocks = split(self.data)
-        report = fit(self.loss, train, held_out, config, self.generator)
+        report = self._fit(train, held_out, config)
         state, action, _ = self.loss.transitions(train)
         metrics: dict[str, Tensor | float] = {
             "model/train_error": report.train_error,
@@ -422,6 +435,18 @@ class ModelTrainer:
                 metrics[f"constants/{name}"] = value.detach()
         return metrics
 
+    def _fit(self, train: TensorDict, held_out: TensorDict, config: FitConfig) -> FitReport:
+        """Fit; the first and the last time choose the integrator too, if the settings say so."""
+        chooses = self.config.integrator == AUTO and config.method == "levenberg_marquardt"
+        if not chooses or not (self.iteration == 1 or self._has_all):
+            return fit(self.loss, train, held_out, config, self.generator)
+        report, trials = fit_solver(self.loss, train, held_out, config, self.generator)
+        if len(trials) > 1:
+            tried = ", ".join(str(trial) for trial in trials)
+            solver = self.dynamics.integrator
+            _log.info("The model is integrated by %s (held-out errors: %s).", solver, tried)
+        return report
+
     def state_dict(self) -> dict[str, Any]:
         """Return the state that a resumed run needs, as tensors and numbers."""
         return {
@@ -429,6 +454,7 @@ class ModelTrainer:
             "initial": self.initial,
             "loss": {name: buffer for name, buffer in self.loss.named_buffers(recurse=False)},
             "data": None if self.data is None else self.data.to_dict(),
+            "integrator": integrator_mapping(self.dynamics.integrator),
             "iteration": self.iteration,
             "new": self._new,
             "dropped": self._dropped,
@@ -444,6 +470,8 @@ class ModelTrainer:
         data = state["data"]
         self.data = None if data is None else TensorDict(data).auto_batch_size_(1)
         self.iteration = state["iteration"]
+        if "integrator" in state:
+            self.dynamics.integrator = read_integrator(state["integrator"])
         self._new, self._dropped = state.get("new", 0), state.get("dropped", 0)
         self.generator.set_state(state["generator"])
 

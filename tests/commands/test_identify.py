@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -33,6 +34,20 @@ STEPS = (
     "world.friction={joint: 0.0}",
     "world.constants={length: 1.1}",
 )
+
+LOGGED = """
+from dataclasses import replace
+from phihp_torchrl import get_task, register_task
+register_task(replace(get_task("pendulum"), name="logged"))
+"""
+
+COLUMNS = """# @package _global_
+task: logged
+columns:
+  time: {column: ms, unit: ms}
+  theta: {column: deg, unit: deg}
+  torque: thrust
+"""
 
 
 def failed(phihp: Command, *words: str) -> str:
@@ -80,22 +95,19 @@ def test_steps_are_kept_where_a_fit_fails(phihp: Command, place: Path) -> None:
     assert not (place / "run/identification.json").exists()
 
 
-def test_a_task_names_the_columns_of_its_logs(
-    phihp: Command, place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.usefixtures("registries")
+def test_a_task_names_the_columns_of_its_logs(phihp: Command, place: Path) -> None:
     rows = ["ms,deg,push", *(f"{50 * k},{k % 3},{(-1) ** k}" for k in range(12))]
     (place / "log.csv").write_text("\n".join(rows))
     (place / "settings/task").mkdir(parents=True)
-    (place / "settings/task/pendulum.yaml").write_text(
-        "# @package _global_\ntask: pendulum\ncolumns:\n  time: {column: ms, unit: ms}\n"
-        "  theta: {column: deg, unit: deg}\n  torque: thrust\n"
-    )
-    words = ("task=pendulum", "--config-dir", "settings", "world=recorded", "world.files=log.csv")
+    (place / "settings/task/logged.yaml").write_text(COLUMNS)
+    (place / "my_log.py").write_text(LOGGED)
+    words = ["task=logged", "plugins=[my_log.py]", "--config-dir", "settings"]
+    words += ["world=recorded", "world.files=log.csv"]
     told = failed(phihp, *words)
     assert "columns.torque" in told
     assert "'thrust'" in told
     assert "['deg', 'ms', 'push']" in told
-    capsys.readouterr()
     told = failed(phihp, *words, "world.columns={torque: push}", *PLAIN)
     assert told.startswith("error: recordings: expected at least two windows")
 
@@ -117,7 +129,7 @@ def test_a_wrong_word_is_one_sentence_before_any_step(
     phihp: Command, place: Path, words: tuple[str, ...], message: str
 ) -> None:
     told = failed(phihp, "task=pendulum", *words)
-    assert __import__("re").search(message, told), told
+    assert re.search(message, told), told
     assert not (place / "outputs").exists()
 
 

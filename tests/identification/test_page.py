@@ -119,7 +119,8 @@ def test_the_page_is_well_formed_and_has_every_part() -> None:
     text = " ".join(" ".join(reader.text).split())
     for words in (
         "A rod", "The clock jitters.", "What to do: Keep its stamps.",
-        "Line 9: a row was left out.", "✓ identified, ± 0.032 %", "◐ only in combination with drag", "Spin it.",
+        "Line 9: a row was left out.", "✓ identified, ± 0.032 %", 
+        "◐ only in combination with drag", "Spin it.",
         "✗ not identified by these data", "▲ at its limit", "■ fixed",
         "gain / drag", "0.3099 to 0.3101",
         "2 steps (0.04 s)", "0.04 to 0.06", "delay 2, lag", "angle (rad), 20 steps", "1.2 ×",

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import pytest
 import torch
 
-from phihp_torchrl import get_task
+from phihp_torchrl import Actuator, get_task
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.recordings import Recording, transitions
 
@@ -78,3 +79,21 @@ def test_a_state_that_nobody_measured_is_refused() -> None:
         transitions(PENDULUM, [recording(state=torch.zeros(6, 3))])
     with pytest.raises(ConfigError, match="no transition"):
         transitions(PENDULUM, [])
+
+
+def test_what_is_under_way_follows_the_commands_of_a_recording():
+    task = replace(get_task("pendulum"), actuator=Actuator(delay_steps=2.0))
+    commands = torch.tensor([[1.0], [-2.0], [0.5], [2.0]])
+    first = Recording(torch.arange(4) * 0.05, torch.zeros(4, 2), commands, source="a.csv")
+    data = transitions(task, [first])
+    waiting = data["observation"][:, task.system.observation_dim :]
+    assert waiting.tolist() == [[0.0, 0.0], [0.0, 0.5], [0.5, -1.0]]
+
+
+def test_a_stretch_that_goes_on_lacks_what_was_under_way():
+    task = replace(get_task("pendulum"), actuator=Actuator(delay_steps=2.0))
+    times = torch.arange(5) * task.time_step
+    first = Recording(times, torch.zeros(5, 2), torch.zeros(5, 1), source="a.csv")
+    second = replace(first, time=times + 10.0)
+    assert len(transitions(task, [first, second])) == 4 + 2
+    assert len(transitions(task, [first, replace(second, episode=1)])) == 4 + 4
