@@ -249,8 +249,8 @@ def of_fit(stopped: Tensor, stops: Stops, fitted: Fitted) -> list[Finding]:
                 "stops",
                 f"{int(stopped.sum())} of {len(stopped)} samples at stops were left out ({what}; "
                 f"{origin}).",
-                "Give the task its position limits, so that imagination and planning stop there "
-                "too; errors at stops are in the region 'stop'.",
+                "Use the task that this identification makes, or give yours these limits, so that "
+                "imagination and planning stop there too; errors there are in the region 'stop'.",
             )
         )
     if fitted.outlying:

@@ -40,6 +40,7 @@ class Fitted(NamedTuple):
 
     Args:
         model: the equations behind the chosen actuator.
+        stopping: the same with stops, for predictions that meet them.
         judged: their parameters, fitted without what is held out; errors are theirs.
         fit: their parameters, fitted to everything; constants are theirs.
         windows: what was fitted in the end.
@@ -50,6 +51,7 @@ class Fitted(NamedTuple):
     """
 
     model: Model
+    stopping: Model
     judged: Fit
     fit: Fit
     windows: Windows
@@ -71,7 +73,7 @@ def fit_recordings(task: Task, samples: Samples, config: IdentifyConfig) -> Fitt
         config: how.
     """
     system = task.system
-    known = {**(getattr(task, "position_limits", None) or {}), **config.stops}
+    known = {**task.position_limits, **config.stops}
     given = check_stops(system, known)
     found = {n: pair for n, pair in suspect_stops(system, samples).items() if n not in given}
     division = divide(system, samples, {**given, **found}, config)
@@ -87,14 +89,18 @@ def fit_recordings(task: Task, samples: Samples, config: IdentifyConfig) -> Fitt
     if division.held:
         spans = cut(division.inside, config.window, LEAST)
         final = _fit_all(model, samples, spans, config, judged.fit.raw, judged.fit.sigma)
-    return Fitted(model, judged.fit, *final, division, tuple(found), chooser.table())
+    limits = {name: pair for name, pair in division.stops.items() if name in system.velocity_of}
+    layout = system.layout(task.velocity_limits, limits, task.restitution)
+    stopping = model.stopping(layout, judged.fit.raw)
+    return Fitted(model, stopping, judged.fit, *final, division, tuple(found), chooser.table())
 
 
 def _choose(task: Task, samples: Samples, division: Division, config: IdentifyConfig) -> Chooser:
     prior = PhysicsPrior(task.system).double()
     name = "rk4" if config.integrator == AUTO else config.integrator
     integrator = make_integrator(name, substeps=config.substeps or 1)
-    model = Model(prior, task.layout, integrator, given_path(config))
+    layout = task.system.layout(task.velocity_limits)  # no fitted window meets a stop
+    model = Model(prior, layout, integrator, given_path(config))
     windows = make_windows(samples, spread(division.short, WINDOWS))
     chooser = Chooser(Trials(samples, windows), model, config)
     chooser.choose_all()

@@ -96,7 +96,7 @@ def _report(
     experiments = Experiments(model, fit, samples, low, high)
     constants = judge_constants(model, fit.raw, doubt, experiments.advise)
     past = (division.past, config.past)
-    judged = judge_predictions(model, samples, fitted.judged, division, past, recordings)
+    judged = judge_predictions(fitted.stopping, samples, fitted.judged, division, past, recordings)
     more, residuals = diagnostics.of_residuals(system, samples, fitted.windows, fit)
     warnings = [
         *diagnostics.of_constants(constants),
@@ -115,6 +115,7 @@ def _report(
         regions=tuple(judged.regions),
         noise={n: float(fit.sigma[system.state_names.index(n)]) for n in names},
         warnings=tuple(warnings),
+        stops={n: x for n, x in division.stops.items() if n in system.velocity_of},
         data=_data(task, samples, recordings, fitted),
         rollouts=tuple(judged.rollouts),
         residuals=residuals,
@@ -151,7 +152,6 @@ def _settings(config: IdentifyConfig, fitted: Fitted) -> dict[str, Any]:
         "integrator": integrator.name,
         **integrator.settings,
         "window": config.window,
-        "stops": {name: list(pair) for name, pair in division.stops.items()},
         "starts_of_predictions": f"fitted to the {division.past} to {config.past} samples before, "
         "as many as there are",
     }

@@ -54,6 +54,17 @@ class Model:
         """The same equations, with one more part of the actuator fitted, from a first guess."""
         return replace(self, fitted=(*self.fitted, name), path=replace(self.path, **{name: value}))
 
+    def stopping(self, layout: StateLayout, raw: Tensor) -> Model:
+        """The same equations in a layout with stops, for constants that stay as they are."""
+        system = self.prior.system
+        constants = self.prior.decode(raw[: self.constants])
+        positions = tuple(system.velocity_of)
+
+        def impulse(pair: int, state: Tensor) -> Tensor:
+            return system.impulse(positions[pair], state, constants)
+
+        return replace(self, layout=layout.coupled(impulse))
+
     def actuator(self, raw: Tensor) -> Actuator:
         """The actuator that belongs to parameters ``[p]``."""
         values = raw[self.constants :].tolist()

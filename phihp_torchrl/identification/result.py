@@ -37,6 +37,7 @@ class Identification:
         regions: errors at the longest horizon by parts of the state space.
         noise: standard deviation of each measured state, in its unit.
         warnings: what must be known; ``str`` of each has the advice with it.
+        stops: stops that the task, the settings or the data gave, by the name of the position.
         data: counts of samples, stretches and windows, and what was left out, by name.
         rollouts: some held-out predictions.
         residuals: what the fit leaves over.
@@ -68,6 +69,7 @@ class Identification:
     noise: Mapping[str, float]
     warnings: tuple[Finding, ...]
     data: Mapping[str, Any]
+    stops: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     rollouts: tuple[Rollout, ...] = ()
     residuals: Residuals | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -97,7 +99,7 @@ class Identification:
         return path
 
     def task(self, task: Task) -> Task:
-        """The task with the fitted constants as first guesses, and with the fitted actuator.
+        """The task with the fitted constants as first guesses, the fitted actuator, and stops.
 
         Args:
             task: the task that was identified.
@@ -109,7 +111,8 @@ class Identification:
             raise ConfigError("task", f"{task.name} has no constants {missing}.")
         values = {name: c.estimate for name, c in self.constants.items() if c.verdict != FIXED}
         system = task.system.with_constants(values)
-        return replace(task, system=system, actuator=self.actuator.actuator)
+        limits = {**self.stops, **task.position_limits}
+        return replace(task, system=system, actuator=self.actuator.actuator, position_limits=limits)
 
     def table(self) -> str:
         """A page for a console."""

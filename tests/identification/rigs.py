@@ -101,4 +101,5 @@ def record(
     level = torch.tensor([0.0 if x != x else x for x in noise], dtype=torch.float64)
     measured += level * torch.randn(measured.shape, generator=generator, dtype=torch.float64)
     measured[:, [x != x for x in noise]] = torch.nan
-    return Recording(seconds.cumsum(0) - seconds[0], measured, command, source="simulated")
+    time = torch.cat([torch.zeros(1, dtype=torch.float64), seconds.cumsum(0)[:-1]])
+    return Recording(time, measured, command, source="simulated")
