@@ -37,13 +37,7 @@ from phihp_torchrl.dynamics import (
     split,
 )
 from phihp_torchrl.imagination import Batch
-from phihp_torchrl.integrators import (
-    check_integrator,
-    has_substeps,
-    integrator_mapping,
-    integrator_of,
-    read_integrator,
-)
+from phihp_torchrl.integrators import check_integrator, has_substeps, integrator_of
 from phihp_torchrl.recordings import transitions
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.collect import (
@@ -454,7 +448,7 @@ class ModelTrainer:
             "initial": self.initial,
             "loss": {name: buffer for name, buffer in self.loss.named_buffers(recurse=False)},
             "data": None if self.data is None else self.data.to_dict(),
-            "integrator": integrator_mapping(self.dynamics.integrator),
+            "solver": self._solver(),
             "iteration": self.iteration,
             "new": self._new,
             "dropped": self._dropped,
@@ -470,10 +464,16 @@ class ModelTrainer:
         data = state["data"]
         self.data = None if data is None else TensorDict(data).auto_batch_size_(1)
         self.iteration = state["iteration"]
-        if "integrator" in state:
-            self.dynamics.integrator = read_integrator(state["integrator"])
+        if (solver := state.get("solver")) is not None:
+            self.dynamics.integrator = SOLVERS[solver]
         self._new, self._dropped = state.get("new", 0), state.get("dropped", 0)
         self.generator.set_state(state["generator"])
+
+    def _solver(self) -> int | None:
+        """The number of the integrator among those that are tried, if it is to be chosen."""
+        if self.config.integrator != AUTO:
+            return None
+        return next((i for i, s in enumerate(SOLVERS) if s is self.dynamics.integrator), None)
 
     def _draw_seed(self) -> int:
         return int(torch.randint(2**31, (), generator=self.generator))
