@@ -5,7 +5,12 @@ from __future__ import annotations
 from phihp_torchrl.dynamics.covariance import constants_covariance, draw_shifts
 from phihp_torchrl.dynamics.ensemble import EnsembleResidual
 from phihp_torchrl.dynamics.fitting import FitConfig, FitReport, fit
-from phihp_torchrl.dynamics.held_out import BLOCK, rollout_error, split
+from phihp_torchrl.dynamics.held_out import (
+    BLOCK,
+    rollout_error,
+    split,
+    successive_correlation,
+)
 from phihp_torchrl.dynamics.hybrid import PRIORS, RESIDUAL_OUTPUTS, HybridDynamics
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.dynamics.per_life import per_life

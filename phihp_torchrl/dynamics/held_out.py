@@ -39,3 +39,24 @@ def rollout_error(loss: DynamicsLoss, blocks: TensorDictBase) -> Tensor:
     state, action, next_state = loss.transitions(blocks)
     predicted = loss.dynamics.rollout(state[:, 0], action, loss.time_step(blocks))[:, -1]
     return loss.dynamics.task.difference(next_state[:, -1], predicted).norm(dim=-1).mean()
+
+
+@torch.no_grad()
+def successive_correlation(loss: DynamicsLoss, data: TensorDictBase) -> dict[str, float]:
+    """Correlation of the one-step errors of consecutive transitions, by name of the state.
+
+    What a model lacks pushes successive errors the same way. Sensor noise pushes them in opposite
+    ways, because a sample that is too high ends one step and starts the next: it tends to -1/2.
+
+    Args:
+        loss: the loss of the fitted model.
+        data: transitions ``[N]``; the observation after one is the one before the next, unless
+            an episode has ended between them.
+    """
+    error = loss.prediction_error(*loss.transitions(data), loss.time_step(data))
+    key = loss.tensor_keys.observation
+    joined = (data.get("next").get(key)[:-1] == data.get(key)[1:]).all(-1)
+    first, second = error[:-1][joined], error[1:][joined]
+    spread = (first.square().mean(0) * second.square().mean(0)).sqrt()
+    values = (first * second).mean(0) / spread.clamp_min(torch.finfo(error.dtype).tiny)
+    return dict(zip(loss.dynamics.task.system.state_names, values.tolist(), strict=True))

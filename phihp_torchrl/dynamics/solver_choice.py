@@ -104,10 +104,13 @@ def fit_solver(
         loss.dynamics.integrator = solver
         return fit(loss, train, held_out, config, generator)
 
-    report = fit_with(solvers[0], config)
+    # Multiple shooting has no use for a solver that one-step errors, which are cheaper, rule out.
+    plain = replace(config, method="levenberg_marquardt")
+    report = fit_with(solvers[0], plain)
     if report.held_out_error <= _GOOD or len(solvers) == 1:
-        return report, [SolverTrial(solvers[0], report)]
-    short = replace(config, steps=min(config.steps, _TRIAL_STEPS))
+        trials = [SolverTrial(solvers[0], report)]
+        return (report if config == plain else fit_with(solvers[0], config)), trials
+    short = replace(plain, steps=min(config.steps, _TRIAL_STEPS))
     trials = [SolverTrial(solver, fit_with(solver, short)) for solver in solvers]
     return fit_with(trials[choose(trials)].integrator, config), trials
 

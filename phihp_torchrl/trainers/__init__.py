@@ -7,10 +7,12 @@ from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.evaluate import EvaluateConfig, EvaluatePhase
 from phihp_torchrl.trainers.exploration import Exploration, ExplorationConfig
 from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
-from phihp_torchrl.trainers.model import ModelConfig, ModelTrainer, make_dynamics
+from phihp_torchrl.trainers.model import ModelTrainer
+from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
 from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_phase
 from phihp_torchrl.trainers.plugins import import_plugins
-from phihp_torchrl.trainers.policy import PolicyConfig, PolicyTrainer
+from phihp_torchrl.trainers.policy import PolicyTrainer
+from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.record import record
 from phihp_torchrl.trainers.results import read_result
 from phihp_torchrl.trainers.run import RunResult, run

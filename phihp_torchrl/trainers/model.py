@@ -5,44 +5,35 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 
 from phihp_torchrl.config import (
     ConfigError,
-    check_choice,
-    check_count,
-    check_not_negative,
-    check_positive,
-    check_widths,
 )
 from phihp_torchrl.dynamics import (
     AUTO,
     BLOCK,
-    RESIDUAL_OUTPUTS,
     SOLVERS,
     DynamicsLoss,
     FitConfig,
     FitReport,
-    HybridDynamics,
     PhysicsPrior,
     constants_covariance,
     fit,
     fit_solver,
-    perturbed_constants,
     rollout_error,
     split,
+    successive_correlation,
 )
 from phihp_torchrl.imagination import Batch
-from phihp_torchrl.integrators import check_integrator, has_substeps, integrator_of
 from phihp_torchrl.recordings import transitions
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.collect import (
-    CollectConfig,
     drop_unusable,
     planning_policy,
     random_policy,
@@ -50,9 +41,9 @@ from phihp_torchrl.trainers.collect import (
 )
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.exploration import Exploration
+from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
 from phihp_torchrl.trainers.phases import Phase, register_phase
 from phihp_torchrl.worlds import (
-    SimulatedWorld,
     World,
     crossings_text,
     disagreements,
@@ -64,166 +55,6 @@ _log = logging.getLogger(__name__)
 
 _SAME_STEP = 1e-3
 """Recorded time steps within this share of the task's are the task's."""
-
-_ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
-
-
-@dataclass(frozen=True)
-class ModelConfig:
-    """Settings of phase 1, which learns the model (paper, section 4.1 and appendix C).
-
-    Args:
-        real_steps: total number of real transitions; 0 is allowed for an oracle. A recorded world
-            gives all that it has.
-        steps_per_iteration: real transitions between two fits, T; null for a tenth of all of them,
-            but at least 50.
-        kind: hybrid (prior + residual), data_driven (no prior), prior (no residual) or oracle (the
-            simulated world itself).
-        constants_error: in a simulated world, relative error of the first guesses of the prior's
-            constants, with signs drawn by the seed; in other worlds the system's guesses are used.
-        hidden_sizes: widths of the residual's hidden layers.
-        activation: activation of the residual: relu, tanh or silu.
-        residual_outputs: components that the residual corrects, velocities (accelerations only) or
-            all (every component of ds/dt).
-        ensemble: number of residual networks; with more than one, each imagined life has one of
-            them and plans use their mean. The time of a fit is proportional to it.
-        integrator: integrator of the model, semi_implicit_euler, rk4 or dopri5; or auto, for the
-            cheapest one with fixed steps that predicts held-out transitions about as well as any.
-        substeps: solver steps in a control step; 1 for dopri5 and auto, which choose their steps.
-        lambda_0: initial λ of the published loss, which divides the weight of ‖F^r‖.
-        tau_ph: growth of λ with the prediction error.
-        warm_start: whether a fit starts from the previous one. The fits between the first and the
-            last then keep the final λ, and take at most refit_steps.
-        refit_steps: largest number of steps of such a fit; the first and the last fit take all.
-        fit: how the model is fitted.
-        collect: how real data are collected.
-
-    Raises:
-        ConfigError: for a value out of range; the message names the field.
-
-    Examples:
-        >>> config = ModelConfig(real_steps=1000, steps_per_iteration=400)
-        >>> config.iterations  # 400, 400 and 200 steps
-        3
-    """
-
-    real_steps: int = 5000
-    steps_per_iteration: int | None = None
-    kind: str = "hybrid"
-    constants_error: float = 0.3
-    hidden_sizes: tuple[int, ...] = (16, 16)
-    activation: str = "tanh"
-    residual_outputs: str = "velocities"
-    ensemble: int = 1
-    integrator: str = AUTO
-    substeps: int = 1
-    lambda_0: float = 1e3
-    tau_ph: float = 1e3
-    warm_start: bool = True
-    refit_steps: int = 15
-    fit: FitConfig = field(default_factory=FitConfig)
-    collect: CollectConfig = field(default_factory=CollectConfig)
-
-    def __post_init__(self) -> None:
-        check_choice(self, "kind", ("hybrid", "data_driven", "prior", "oracle"))
-        check_count(self, "real_steps", least=0 if self.kind == "oracle" else 1)
-        if self.steps_per_iteration is not None:
-            check_count(self, "steps_per_iteration")
-        check_count(self, "refit_steps", "ensemble")
-        if self.ensemble > 1 and self.kind not in ("hybrid", "data_driven"):
-            raise ConfigError(
-                "ensemble",
-                f"expected 1 for a model of kind {self.kind!r}, which has no residual, "
-                f"got {self.ensemble}.",
-            )
-        check_choice(self, "residual_outputs", RESIDUAL_OUTPUTS)
-        check_choice(self, "activation", _ACTIVATIONS)
-        if self.integrator != AUTO:
-            check_integrator(self)
-        elif self.substeps != 1:
-            raise ConfigError("substeps", f"expected 1 for {AUTO}, got {self.substeps}.")
-        check_widths(self, "hidden_sizes")
-        check_positive(self, "lambda_0")
-        check_not_negative(self, "tau_ph")
-        if not 0 <= self.constants_error < 1:
-            raise ConfigError(
-                "constants_error",
-                f"expected a relative error in [0, 1), got {self.constants_error}.",
-            )
-        chooses = self.integrator != AUTO and not has_substeps(self.integrator)
-        if self.kind != "oracle" and self.fit.method != "adam" and chooses:
-            raise ConfigError(
-                "fit.method",
-                f"expected 'adam' for a model that is integrated by {self.integrator}, which "
-                f"chooses its own steps, got {self.fit.method!r}.",
-            )
-
-    @property
-    def period(self) -> int:
-        """Real transitions between two fits, T."""
-        return self.steps_per_iteration or max(50, -(-self.real_steps // 10))
-
-    @property
-    def iterations(self) -> int:
-        """Number of fits."""
-        return -(-self.real_steps // self.period)
-
-
-def make_dynamics(
-    world: World, config: ModelConfig, generator: torch.Generator | None = None
-) -> HybridDynamics:
-    """Build the untrained model that ``config`` describes, for the task of ``world``.
-
-    Args:
-        world: the world. If it is simulated, its equations are the oracle's model, and its true
-            constants are perturbed for the first guesses.
-        config: settings of phase 1.
-        generator: source of the signs of the errors of the first guesses. The initial weights of
-            networks come from torch's global generator.
-
-    Raises:
-        ConfigError: for an oracle in a world that is not simulated.
-    """
-    task = world.task
-    if config.kind == "oracle":
-        if not isinstance(world, SimulatedWorld):
-            raise ConfigError(
-                "model.kind", f"expected another than 'oracle': {world} has no truth to plan with."
-            )
-        return world.oracle()
-    # The cheapest is the first that is tried (fit_solver).
-    integrator = SOLVERS[0] if config.integrator == AUTO else integrator_of(config)
-    activation, sizes = _ACTIVATIONS[config.activation], config.hidden_sizes
-    if config.kind == "data_driven":
-        return HybridDynamics.data_driven(
-            task,
-            hidden_sizes=sizes,
-            activation=activation,
-            integrator=integrator,
-            ensemble=config.ensemble,
-        )
-    guess = _first_guess(world, config.constants_error, generator)
-    if config.kind == "prior":
-        return HybridDynamics.pure_prior(task, constants=guess, integrator=integrator)
-    return HybridDynamics.hybrid(
-        task,
-        constants=guess,
-        hidden_sizes=sizes,
-        activation=activation,
-        residual_outputs=config.residual_outputs,
-        integrator=integrator,
-        ensemble=config.ensemble,
-    )
-
-
-def _first_guess(world: World, error: float, generator: torch.Generator | None) -> dict[str, float]:
-    """First guesses: those of the system, or perturbed true constants in a simulated world."""
-    ranges = world.task.system.ranges
-    if world.truth is None:
-        return {name: c.guess for name, c in ranges.items()}
-    wrong = perturbed_constants(world.truth.constants, error, generator)
-    # Fixed and bounded constants keep the guess of the system.
-    return {n: c.guess if c.fixed or c.bounded else wrong[n] for n, c in ranges.items()}
 
 
 class ModelTrainer:
@@ -439,6 +270,8 @@ class ModelTrainer:
             )
         train, held_out, blocks = split(self.data)
         report = self._fit(train, held_out, config)
+        if config.method != "multiple_shooting" and report.held_out_error > 1e-4:
+            self._tell_noise(train)
         state, action, _ = self.loss.transitions(train)
         metrics: dict[str, Tensor | float] = {
             "model/train_error": report.train_error,
@@ -456,9 +289,21 @@ class ModelTrainer:
                 metrics[f"constants/{name}"] = value.detach()
         return metrics
 
+    def _tell_noise(self, data: TensorDict) -> None:
+        """Warn, once, where sensor noise dominates the errors of single steps."""
+        noisy = {n: c for n, c in successive_correlation(self.loss, data).items() if c < -0.3}
+        if noisy and "noise" not in self._told:
+            self._told.add("noise")
+            _log.warning(
+                "The errors of successive steps go against each other (correlation %s), as sensor "
+                "noise makes them; it biases a fit of single steps. Take "
+                "model.fit.method=multiple_shooting.",
+                ", ".join(f"{value:.2f} in {name}" for name, value in noisy.items()),
+            )
+
     def _fit(self, train: TensorDict, held_out: TensorDict, config: FitConfig) -> FitReport:
         """Fit; the first and the last time choose the integrator too, if the settings say so."""
-        chooses = self.config.integrator == AUTO and config.method == "levenberg_marquardt"
+        chooses = self.config.integrator == AUTO and config.method != "adam"
         if not chooses or not (self.iteration == 1 or self._has_all):
             return fit(self.loss, train, held_out, config, self.generator)
         report, trials = fit_solver(self.loss, train, held_out, config, self.generator)

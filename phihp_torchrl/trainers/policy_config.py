@@ -1,0 +1,136 @@
+"""The settings of phase 2, which trains the policy in the model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from phihp_torchrl.agents import (
+    RefitConfig,
+    TD3Config,
+)
+from phihp_torchrl.config import (
+    ConfigError,
+    check_choice,
+    check_count,
+    check_not_negative,
+    check_positive,
+    check_share,
+)
+from phihp_torchrl.imagination import StartConfig
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Settings of phase 2, which trains actor and critics in imagination (paper, section 4.2).
+
+    Args:
+        updates: total number of critic updates.
+        batch_size: transitions in an update.
+        num_worlds: number of imagined worlds that are stepped at once.
+        chunk_steps: steps of all worlds between two rounds of updates.
+        updates_per_step: critic updates for each step of all worlds.
+        replay_capacity: imagined transitions kept for replay.
+        random_steps: imagined transitions under random actions before the first update.
+        exploration_noise: std of the noise on actions, in units of the action's half-range.
+        random_fraction: share of actions that are uniformly random.
+        max_age: steps after which an imagined episode is truncated; null for the task's limit.
+        decay: share of the updates, at the end, over which learning rates fall to a twentieth.
+        evaluation_interval: updates between two evaluations in the model, which choose the actor to
+            keep.
+        evaluation_episodes: imagined episodes in an evaluation.
+        evaluation_steps: steps in these episodes; null for the task's limit.
+        real_evaluation_episodes: episodes of the actor in a simulated world at each evaluation,
+            which are logged and not used for training; 0 for none.
+        max_seconds: duration after which the phase ends early; null for no limit.
+        scales: auto to train in units measured from the task's coverage, where observations or
+            values are far from the size of one; none to train in physical units.
+        draw_constants: whether every imagined world has constants of its own, drawn from the 95 %
+            interval that the fit of the model leaves them.
+        constants_std: standard deviation that takes the place of the fit's: of a free constant
+            relative, of a bounded one of the logit of its place; null for the fit's.
+        start: where imagined episodes start.
+        td3: hyper-parameters of TD3.
+        refit: when and how the critics are fitted to the best actor's returns in the model.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> PolicyConfig(random_fraction=1.5)
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: random_fraction: expected a number in [0, 1], got 1.5.
+    """
+
+    updates: int = 8000
+    batch_size: int = 128
+    num_worlds: int = 64
+    chunk_steps: int = 4
+    updates_per_step: int = 8
+    replay_capacity: int = 200_000
+    random_steps: int = 2048
+    exploration_noise: float = 0.1
+    random_fraction: float = 0.1
+    max_age: int | None = None
+    decay: float = 0.5
+    evaluation_interval: int = 500
+    evaluation_episodes: int = 64
+    evaluation_steps: int | None = None
+    real_evaluation_episodes: int = 10
+    max_seconds: float | None = None
+    scales: str = "auto"
+    draw_constants: bool = False
+    constants_std: float | None = None
+    start: StartConfig = field(default_factory=StartConfig)
+    td3: TD3Config = field(default_factory=TD3Config)
+    refit: RefitConfig = field(default_factory=RefitConfig)
+
+    def __post_init__(self) -> None:
+        check_count(
+            self,
+            "updates",
+            "batch_size",
+            "num_worlds",
+            "chunk_steps",
+            "updates_per_step",
+            "replay_capacity",
+            "evaluation_interval",
+            "evaluation_episodes",
+        )
+        check_choice(self, "scales", ("auto", "none"))
+        check_share(self, "random_fraction", "decay")
+        check_count(self, "random_steps", "real_evaluation_episodes", least=0)
+        check_not_negative(self, "exploration_noise")
+        if self.random_steps > self.replay_capacity:
+            raise ConfigError(
+                "random_steps",
+                f"expected at most replay_capacity = {self.replay_capacity}, "
+                f"got {self.random_steps}.",
+            )
+        if self.constants_std is not None and not self.draw_constants:
+            raise ConfigError(
+                "constants_std",
+                f"expected null without draw_constants=true, got {self.constants_std}.",
+            )
+        for name in ("max_age", "evaluation_steps", "max_seconds", "constants_std"):
+            if getattr(self, name) is not None:
+                check_positive(self, name)
+        chunk_updates = self.chunk_steps * self.updates_per_step
+        for name, value in (
+            ("chunk_steps * updates_per_step", chunk_updates),
+            ("evaluation_interval", self.evaluation_interval),
+        ):
+            if value % self.td3.policy_delay:
+                raise ConfigError(
+                    name,
+                    f"expected a multiple of td3.policy_delay = {self.td3.policy_delay}, "
+                    f"got {value}.",
+                )
+        for name in ("start", "interval") if self.refit.interval else ():
+            value = getattr(self.refit, name)
+            if value % self.evaluation_interval:
+                raise ConfigError(
+                    f"refit.{name}",
+                    f"expected a multiple of evaluation_interval = {self.evaluation_interval}, "
+                    f"got {value}.",
+                )
