@@ -79,7 +79,7 @@ def test_the_textbook_with_true_constants_predicts_and_the_guesses_do_not(name):
     found = shares(known(world, TRUTH[name]), data, world.stops)["1"]
     guessed = shares(known(world, {}), data, world.stops)["1"]
     assert found["overall"]["all"] < 0.1, "friction, and a rod that is no line, are left out"
-    assert guessed["overall"]["all"] > 3 * found["overall"]["all"]
+    assert guessed["overall"]["all"] > 2 * found["overall"]["all"]
     if name == "dm_control cartpole":  # it has met its stop
         assert found["away"]["windows"] < found["overall"]["windows"]
 
