@@ -20,6 +20,7 @@ FOLDERS = (
     "tasks",
     "recordings",
     "dynamics",
+    "identification",
     "imagination",
     "agents",
     "planners",

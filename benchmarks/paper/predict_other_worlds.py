@@ -67,15 +67,16 @@ def measure(name: str, seed: int) -> dict[str, Any]:
 def unseen(trainer: ModelTrainer, seed: int) -> TensorDict:
     """Transitions that no fit sees, from random and from planned actions."""
     generator = torch.Generator().manual_seed(seed + 1000)
-    task, config = trainer.task, trainer.config.collect
+    task, config, env = trainer.task, trainer.config.collect, trainer.env
+    assert env is not None
     parts: list[TensorDict] = []
     for policy in (
         random_policy(task, config, generator),
         planning_policy(task, trainer.dynamics, config, generator, config.noise),
     ):
-        trainer.env.set_seed(seed + 1000 + len(parts))
+        env.set_seed(seed + 1000 + len(parts))
         with torch.no_grad():
-            rollout = trainer.env.rollout(TESTED, policy, break_when_any_done=False)
+            rollout = env.rollout(TESTED, policy, break_when_any_done=False)
         keys: tuple[Any, ...] = ("observation", "action", ("next", "observation"), ("next", "done"))
         part = rollout.select(*keys).clone()
         part["next", "done"][-1] = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,7 +49,8 @@ def learn(
 
     Args:
         task: a task, which is registered if it is not yet, or the name of a registered one.
-        world: the source of real steps, in any form that :func:`~phihp_torchrl.make_world` accepts.
+        world: the source of real steps, in any form that :func:`~phihp_torchrl.make_world` accepts,
+            recordings among them.
         method: ``"phihp"``, or the name of another registered method.
         preset: ``"default"`` or ``"paper"``.
         overrides: further settings, as on a command line or as a mapping from dotted keys.
@@ -89,9 +91,15 @@ def learn(
     else:
         task_name = task
     settings = load_config(
-        task_name, method=method, preset=preset, overrides=words, config_dir=config_dir
+        task_name,
+        method=method,
+        preset=preset,
+        overrides=[*words, *_with_columns(world)],
+        config_dir=config_dir,
     )
-    if any(key.split(".")[0] == "world" for key in lines):
+    if _with_columns(world):
+        world = settings["world"]
+    elif any(key.split(".")[0] == "world" for key in lines):
         if world != "simulated":
             raise ConfigError("world", "expected it as an argument or in overrides, got both.")
         world = settings["world"]
@@ -107,6 +115,18 @@ def learn(
     if not directory.agent.is_dir():
         raise ConfigError("phases", "expected 'evaluate' among them, which saves the agent.")
     return Learned(load_agent(directory.agent, task=reality.task), result.path)
+
+
+def _with_columns(world: Any) -> list[str]:
+    """The words for a world with columns, which the settings of a task may name as well."""
+    if is_dataclass(world) and getattr(world, "kind", None) in WORLDS:
+        world = kind_mapping(world)
+    if not isinstance(world, Mapping) or world.get("kind") not in WORLDS:
+        return []
+    if "columns" not in {f.name for f in fields(WORLDS[world["kind"]].config)}:
+        return []
+    given = {f"world.{key}": value for key, value in world.items() if key != "kind"}
+    return override_lines({"world": world["kind"], **given})
 
 
 def _world_settings(world: World) -> dict[str, Any]:

@@ -34,7 +34,7 @@ PLACES = ("run_dir", "resume")
 _GROUPS = ("preset", "task", "method", "budget", "logger", "world", "planner")
 _NAMES = ("task", "preset", "method")
 # Settings that are mappings with names of a user's choice, or that change something by name.
-_MAPPINGS = ("actuator", r"world\.actuator", r"world\.friction", r"world\.constants")
+_MAPPINGS = ("actuator", r"world\.(?:actuator|friction|constants|noise)")
 _FIRST_PLANNER = "cem"  # the kind of planner that a layer's numbers are for if it names none
 
 
@@ -131,6 +131,7 @@ def finish(composed: Any, overrides: Sequence[str]) -> dict[str, Any]:
     """
     config: Any = OmegaConf.create(OmegaConf.to_container(composed, resolve=True))
     presets, changes = config.pop("presets", None) or {}, config.pop("changes", None) or {}
+    _name_columns(config)
     preset = presets.get(config.get("preset")) or {}
     for name, section in ((f"presets.{config.get('preset')}", preset), ("changes", changes)):
         section = _for_planner(section, config)
@@ -223,6 +224,13 @@ def _quoted(value: Any) -> str:
         escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + m[2].replace("'", "\\'"), value)
         return f"'{escaped}'"
     return repr(value)
+
+
+def _name_columns(config: Any) -> None:
+    """Give the columns that a task's file names to the world, if it is one that has columns."""
+    columns = config.pop("columns", None) or {}
+    if "columns" in (config.get("world") or {}):
+        config["world"]["columns"] = {**columns, **config["world"]["columns"]}
 
 
 def _for_planner(section: Mapping[str, Any], config: Mapping[str, Any]) -> Mapping[str, Any]:

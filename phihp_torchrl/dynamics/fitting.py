@@ -1,9 +1,10 @@
-"""Fitting a model to transitions: by Adam, as published, or by Levenberg-Marquardt."""
+"""Fitting a model to transitions: by Adam, as published, or by least squares."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,8 +13,12 @@ from torch import Tensor
 from torch.func import functional_call, jacrev, vmap
 
 from phihp_torchrl.config import ConfigError, check_choice, check_count, check_positive
+from phihp_torchrl.dynamics.ensemble import EnsembleResidual
 from phihp_torchrl.dynamics.loss import DynamicsLoss
+from phihp_torchrl.dynamics.members import member_loss
+from phihp_torchrl.dynamics.residual import ResidualMLP
 from phihp_torchrl.dynamics.robust import huber_loss, huber_weight, robust_spread
+from phihp_torchrl.dynamics.shooting import multiple_shooting
 
 
 @dataclass(frozen=True)
@@ -21,21 +26,24 @@ class FitConfig:
     """How a model is fitted to transitions.
 
     Args:
-        method: ``"levenberg_marquardt"`` or ``"adam"``. The model is small and its loss is a sum of
-            squares, so a second-order method reaches within seconds errors that Adam never reaches.
+        method: ``"levenberg_marquardt"``, ``"multiple_shooting"`` or ``"adam"``. The model is small
+            and its loss is a sum of squares, so a second-order method reaches within seconds errors
+            that Adam never reaches. Multiple shooting is for noisy sensors: it fits trajectories
+            whose starts are free.
         steps: number of optimization steps.
         scaled: whether errors are measured in units of one-step changes
             (:meth:`DynamicsLoss.set_scales`), or in raw units as published.
         batch_size: transitions per step; ``None`` for all of them, as published.
         learning_rate: learning rate of Adam.
         cosine_decay: whether the learning rate of Adam decays to zero.
-        initial_lambda: first value of λ for Levenberg-Marquardt. A small one lets the prior explain
-            as much as it can before the residual contributes.
-        final_lambda: last value of λ for Levenberg-Marquardt.
-        patience: Levenberg-Marquardt stops after this many steps at its final λ in which the
-            held-out error did not fall by a tenth.
-        shuffle_actions: whether the penalty of Levenberg-Marquardt pairs each state with the action
-            of another transition. A controller's actions are correlated with the velocities, so
+        initial_lambda: first value of λ for methods of least squares. A small one lets the prior
+            explain as much as it can before the residual contributes.
+        final_lambda: last value of λ for them.
+        patience: they stop after this many steps at the final λ in which the held-out error did not
+            fall by a tenth (multiple shooting: by a hundredth).
+        window: steps in a trajectory of multiple shooting.
+        shuffle_actions: whether the penalty on F^r of Levenberg-Marquardt pairs each state with the
+            action of another transition. The actions of a controller go with the velocities, so
             that the smallest F^r on the pairs as recorded would explain friction by a wrong effect
             of the action.
         robust: errors of Levenberg-Marquardt beyond so many robust standard deviations count in
@@ -50,8 +58,8 @@ class FitConfig:
         >>> FitConfig(method="newton")
         Traceback (most recent call last):
         ...
-        phihp_torchrl.config.ConfigError: method: expected one of ['levenberg_marquardt', 'adam'], \
-got 'newton'.
+        phihp_torchrl.config.ConfigError: method: expected one of ['levenberg_marquardt', \
+'multiple_shooting', 'adam'], got 'newton'.
     """
 
     method: str = "levenberg_marquardt"
@@ -63,12 +71,13 @@ got 'newton'.
     initial_lambda: float = 1e-2
     final_lambda: float = 1e7
     patience: int = 8
+    window: int = 20
     shuffle_actions: bool = True
     robust: float | None = None
 
     def __post_init__(self) -> None:
-        check_choice(self, "method", ("levenberg_marquardt", "adam"))
-        check_count(self, "steps", "patience")
+        check_choice(self, "method", _METHODS)
+        check_count(self, "steps", "patience", "window")
         check_positive(self, "learning_rate", "initial_lambda", "final_lambda")
         if self.batch_size is not None:
             check_count(self, "batch_size")
@@ -77,7 +86,7 @@ got 'newton'.
             if self.method != "levenberg_marquardt":
                 raise ConfigError(
                     "robust",
-                    f"expected null with method={self.method!r}, which has squares alone, "
+                    f"expected null with method={self.method!r}, which has a loss of its own, "
                     f"got {self.robust}.",
                 )
 
@@ -89,7 +98,7 @@ class FitReport:
     Args:
         train_error: error on the transitions that were fitted.
         held_out_error: error on the held-out transitions.
-        steps: optimization steps that were taken.
+        steps: optimization steps that were taken, by all members of an ensemble together.
         seconds: duration of the fit.
     """
 
@@ -108,11 +117,15 @@ def fit(
 ) -> FitReport:
     """Fit ``loss.dynamics`` to transitions in place, starting from its current parameters.
 
+    The members of an :class:`EnsembleResidual` are fitted one after the other, each as if it were
+    alone: the first with the prior to all of ``train``, the others without it to draws of as many
+    transitions with replacement. The errors reported are those of their mean.
+
     Args:
         loss: the loss of the model; its λ and scales are changed as well.
         train: transitions ``[N]`` to learn from.
-        held_out: transitions ``[M]`` on which the error is measured; Levenberg-Marquardt keeps the
-            parameters with the smallest error on them.
+        held_out: transitions ``[M]`` on which the error is measured; methods of least squares keep
+            the parameters with the smallest error on them.
         config: method and hyper-parameters of the fit.
         generator: source of mini-batches. Defaults to torch's global generator.
 
@@ -121,8 +134,8 @@ def fit(
 
     Raises:
         ValueError: if there are no transitions, or some are not finite.
-        ConfigError: for Levenberg-Marquardt with an integrator that chooses its own steps, which
-            cannot be differentiated row by row.
+        ConfigError: for least squares with an integrator that chooses its own steps, which cannot
+            be differentiated row by row.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -145,7 +158,7 @@ def fit(
         # Check the observations, because atan2 makes a finite angle of infinite cosines and sines.
         if not all(data.get(key).isfinite().all() for key in loss.in_keys):
             raise ValueError(f"{name}: expected finite transitions, got some that are not.")
-    if config.method == "levenberg_marquardt" and not loss.dynamics.integrator.compiles:
+    if config.method != "adam" and not loss.dynamics.integrator.compiles:
         raise ConfigError(
             "method",
             "expected 'adam' for a model that is integrated by "
@@ -154,14 +167,40 @@ def fit(
     start = time.perf_counter()
     if config.scaled:
         loss.set_scales(train)
-    method = _adam if config.method == "adam" else _levenberg_marquardt
-    steps = method(loss, train, held_out, config, generator)
+    if isinstance(loss.dynamics.residual, EnsembleResidual):
+        steps = _fit_members(loss, loss.dynamics.residual, train, held_out, config, generator)
+    else:
+        steps = _METHODS[config.method](loss, train, held_out, config, generator)
     return FitReport(
         train_error=_error(loss, train),
         held_out_error=_error(loss, held_out),
         steps=steps,
         seconds=time.perf_counter() - start,
     )
+
+
+def _fit_members(
+    loss: DynamicsLoss,
+    ensemble: EnsembleResidual,
+    train: TensorDictBase,
+    held_out: TensorDictBase,
+    config: FitConfig,
+    generator: torch.Generator | None,
+) -> int:
+    method = _adam if config.method == "adam" else _levenberg_marquardt
+    steps, count = 0, len(train)
+    for index in range(ensemble.members):
+        own = member_loss(loss, index)
+        drawn = train
+        if index > 0:
+            drawn = train[torch.randint(count, (count,), generator=generator)]
+        steps += method(own, drawn, held_out, config, generator)
+        fitted = own.dynamics.residual
+        assert isinstance(fitted, ResidualMLP)
+        ensemble.set_member(index, fitted)
+    with torch.no_grad():
+        loss.lambda_.copy_(own.lambda_)  # every member's has grown alike
+    return steps
 
 
 @torch.no_grad()
@@ -213,7 +252,7 @@ def _levenberg_marquardt(
     if config.shuffle_actions:
         order = torch.randperm(len(penalised_action), generator=generator)
         penalised_action = penalised_action[order]
-    reference = loss.transitions(held_out)
+    reference, seconds = _timed(loss, held_out), loss.time_step(train)
     theta = system.parameters()
     damping = 1e-2
     growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
@@ -226,6 +265,7 @@ def _levenberg_marquardt(
     while steps < config.steps:
         steps += 1
         rows: tuple[Tensor, ...] = (*transitions, penalised_action)
+        rows += () if seconds is None else (seconds,)
         if config.batch_size is not None and config.batch_size < len(train):
             index = torch.randint(len(train), (config.batch_size,), generator=generator)
             rows = tuple(part[index] for part in rows)
@@ -242,6 +282,19 @@ def _levenberg_marquardt(
     return steps
 
 
+def _timed(loss: DynamicsLoss, data: TensorDictBase) -> tuple[Tensor, ...]:
+    """The arguments of :meth:`DynamicsLoss.terms`, with time steps where the data have them."""
+    transition, seconds = loss.transitions(data), loss.time_step(data)
+    return transition if seconds is None else (*transition, transition[1], seconds)
+
+
+_METHODS = {
+    "levenberg_marquardt": _levenberg_marquardt,
+    "multiple_shooting": multiple_shooting,
+    "adam": _adam,
+}
+
+
 class _LeastSquares:
     """The residuals of the least-squares problem, and their Jacobian, by one parameter vector."""
 
@@ -249,9 +302,6 @@ class _LeastSquares:
         self.loss, self.robust = loss, robust
         self.named = dict(loss.named_parameters())
         self.sizes = [p.numel() for p in self.named.values()]
-        self._errors = vmap(self._error, (None, 0, 0, 0))
-        self._rows = vmap(self._row, (None, 0, 0, 0, 0))
-        self._jacobian = vmap(jacrev(self._row), (None, 0, 0, 0, 0))
 
     def parameters(self) -> Tensor:
         return torch.cat([p.detach().reshape(-1) for p in self.named.values()])
@@ -276,18 +326,21 @@ class _LeastSquares:
         return torch.cat([error, residual / self.loss.lambda_.sqrt()])
 
     def prediction_error(self, theta: Tensor, transitions: tuple[Tensor, ...]) -> float:
-        errors = self._errors(theta, *transitions)
+        errors = _each(self._error)(theta, *transitions)
         if self.robust is not None:
             bend = self.robust * robust_spread(errors)
             return huber_loss(errors, bend).sum(-1).mean().item()
         return errors.square().sum(-1).mean().item()
+
+    def _rows(self, theta: Tensor, *rows: Tensor) -> Tensor:
+        return _each(self._row)(theta, *rows)
 
     def step(
         self, theta: Tensor, rows: tuple[Tensor, ...], damping: float
     ) -> tuple[Tensor, float, bool]:
         """Take one damped step: new parameters, new damping, and whether the cost has fallen."""
         values = self._rows(theta, *rows)
-        jacobian = self._jacobian(theta, *rows).reshape(values.numel(), -1)
+        jacobian = _each(jacrev(self._row))(theta, *rows).reshape(values.numel(), -1)
         bend = self._bend(values)
         cost = self._cost(values, bend)
         if bend is not None:
@@ -316,6 +369,15 @@ class _LeastSquares:
     @staticmethod
     def _cost(values: Tensor, bend: Tensor | None) -> Tensor:
         return (values.square() if bend is None else huber_loss(values, bend)).reshape(-1).sum()
+
+
+def _each(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Map a function of parameters and one transition over all transitions."""
+
+    def mapped(theta: Tensor, *rows: Tensor) -> Tensor:
+        return vmap(function, (None, *[0] * len(rows)))(theta, *rows)
+
+    return mapped
 
 
 class _Terms(torch.nn.Module):

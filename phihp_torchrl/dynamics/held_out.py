@@ -37,5 +37,5 @@ def split(data: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase, TensorD
 def rollout_error(loss: DynamicsLoss, blocks: TensorDictBase) -> Tensor:
     """Mean distance ‖s - ŝ‖ after the last step of each block ``[blocks, steps]``, raw units."""
     state, action, next_state = loss.transitions(blocks)
-    predicted = loss.dynamics.rollout(state[:, 0], action)[:, -1]
+    predicted = loss.dynamics.rollout(state[:, 0], action, loss.time_step(blocks))[:, -1]
     return loss.dynamics.task.difference(next_state[:, -1], predicted).norm(dim=-1).mean()

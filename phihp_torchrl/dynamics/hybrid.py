@@ -9,9 +9,16 @@ import torch
 from torch import Tensor, nn
 
 from phihp_torchrl.config import ConfigError, Registry
+from phihp_torchrl.dynamics.ensemble import EnsembleResidual
 from phihp_torchrl.dynamics.prior import PhysicsPrior
 from phihp_torchrl.dynamics.residual import ResidualMLP
-from phihp_torchrl.integrators import Integrator, make_integrator
+from phihp_torchrl.integrators import (
+    Integrator,
+    integrator_mapping,
+    make_integrator,
+    read_integrator,
+)
+from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import Task
 
 RESIDUAL_OUTPUTS = ("velocities", "all")
@@ -80,6 +87,7 @@ class HybridDynamics(nn.Module):
         activation: type[nn.Module] = nn.Tanh,
         residual_outputs: str = "velocities",
         integrator: str | Integrator = "semi_implicit_euler",
+        ensemble: int = 1,
     ) -> HybridDynamics:
         """Build the model of the paper: a prior with learned constants, and a residual network.
 
@@ -92,9 +100,11 @@ class HybridDynamics(nn.Module):
                 position is its velocity by definition), ``"all"`` every component of ds/dt, as
                 published.
             integrator: name of an integrator, or an instance.
+            ensemble: number of residual networks (:class:`EnsembleResidual`); 1 for a single one.
 
         Raises:
-            ConfigError: for an unknown ``residual_outputs``, integrator or constant.
+            ConfigError: for an unknown ``residual_outputs``, integrator or constant, and for an
+                ensemble of less than one.
         """
         if residual_outputs not in RESIDUAL_OUTPUTS:
             raise ConfigError(
@@ -106,7 +116,7 @@ class HybridDynamics(nn.Module):
         return cls(
             task,
             prior=PhysicsPrior(system, constants),
-            residual=ResidualMLP(system, hidden_sizes, outputs, activation),
+            residual=_residual(system, hidden_sizes, outputs, activation, ensemble),
             integrator=integrator,
         )
 
@@ -118,9 +128,10 @@ class HybridDynamics(nn.Module):
         hidden_sizes: Sequence[int] = (16, 16),
         activation: type[nn.Module] = nn.Tanh,
         integrator: str | Integrator = "semi_implicit_euler",
+        ensemble: int = 1,
     ) -> HybridDynamics:
         """Build the transition without F^p, the paper's data-driven model."""
-        residual = ResidualMLP(task.system, hidden_sizes, activation=activation)
+        residual = _residual(task.system, hidden_sizes, None, activation, ensemble)
         return cls(task, prior=None, residual=residual, integrator=integrator)
 
     @classmethod
@@ -148,7 +159,7 @@ class HybridDynamics(nn.Module):
                 name: None if part is None else _config_of(name, part)
                 for name, part in parts.items()
             },
-            "integrator": {"name": self.integrator.name, **self.integrator.settings},
+            "integrator": integrator_mapping(self.integrator),
         }
 
     @classmethod
@@ -162,20 +173,26 @@ class HybridDynamics(nn.Module):
         if prior is not None:
             prior = PRIORS.find(prior["kind"]).from_config(task.system, prior)
         if residual is not None:
-            residual = ResidualMLP.from_config(task.system, residual)
-        integrator = dict(config["integrator"])
-        solver = make_integrator(integrator.pop("name"), **integrator)
+            kind = EnsembleResidual if "members" in residual else ResidualMLP
+            residual = kind.from_config(task.system, residual)
+        solver = read_integrator(config["integrator"])
         return cls(task, prior=prior, residual=residual, integrator=solver)
 
-    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+    def forward(self, state: Tensor, action: Tensor, time_step: Tensor | None = None) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
-        return self.step(state, self.task.clip_action(action))
+        return self.step(state, self.task.clip_action(action), time_step)
 
-    def step(self, state: Tensor, action: Tensor) -> Tensor:
-        """The next state for what acts on the system, as :meth:`Task.transition` needs it."""
-        return self.integrator(
-            lambda s: self.derivative(s, action), state, self.task.time_step, self.layout
-        )
+    def step(self, state: Tensor, action: Tensor, time_step: Tensor | None = None) -> Tensor:
+        """The next state for what acts on the system, as :meth:`Task.transition` needs it.
+
+        Args:
+            state: states of the system ``[*batch, n]``.
+            action: what acts on it, ``[*batch, m]``.
+            time_step: seconds for which each action is held, ``[*batch, 1]``. Defaults to the time
+                step of the task.
+        """
+        seconds = self.task.time_step if time_step is None else time_step
+        return self.integrator(lambda s: self.derivative(s, action), state, seconds, self.layout)
 
     def derivative(self, state: Tensor, action: Tensor) -> Tensor:
         """ds/dt = F^p + F^r, ``[*batch, n]``."""
@@ -195,21 +212,35 @@ class HybridDynamics(nn.Module):
         return residual / (prior + residual).clamp_min(torch.finfo(state.dtype).tiny)
 
     @torch.no_grad()
-    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+    def rollout(self, state: Tensor, actions: Tensor, time_step: Tensor | None = None) -> Tensor:
         """Predict the states of a sequence of actions.
 
         Args:
             state: first state, ``[*batch, n]``.
             actions: what acts on the system in each step, ``[*batch, time, m]``.
+            time_step: seconds for which each is held, ``[*batch, time, 1]``. Defaults to the time
+                step of the task.
 
         Returns:
             States after each action, ``[*batch, time, n]``.
         """
         states = []
-        for action in actions.unbind(-2):
-            state = self.step(state, action)
+        for k, action in enumerate(actions.unbind(-2)):
+            state = self.step(state, action, None if time_step is None else time_step[..., k, :])
             states.append(state)
         return torch.stack(states, -2)
+
+
+def _residual(
+    system: System,
+    hidden_sizes: Sequence[int],
+    outputs: Sequence[int] | None,
+    activation: type[nn.Module],
+    ensemble: int,
+) -> ResidualMLP:
+    if ensemble == 1:
+        return ResidualMLP(system, hidden_sizes, outputs, activation)
+    return EnsembleResidual(system, ensemble, hidden_sizes, outputs, activation)
 
 
 def _config_of(name: str, part: nn.Module) -> dict[str, Any]:

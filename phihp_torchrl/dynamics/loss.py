@@ -58,6 +58,7 @@ class DynamicsLoss(LossModule):
 
         observation: NestedKey = "observation"
         action: NestedKey = "action"
+        time_step: NestedKey = "time_step"  # optional; the task's time step where it is absent
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -93,13 +94,15 @@ class DynamicsLoss(LossModule):
 
         Args:
             tensordict: ``"observation"`` ``[*batch, o]``, ``"action"`` ``[*batch, m]``,
-                ``("next", "observation")`` ``[*batch, o]``.
+                ``("next", "observation")`` ``[*batch, o]``, and where time steps differ
+                ``"time_step"`` ``[*batch, 1]`` in seconds.
 
         Returns:
             ``loss_prediction`` and ``loss_residual``, whose sum is to be minimised, and the
             detached ``residual_norm``; scalars.
         """
-        error, residual = self.terms(*self.transitions(tensordict))
+        transition, seconds = self.transitions(tensordict), self.time_step(tensordict)
+        error, residual = self.terms(*transition, time_step=seconds)
         loss_prediction = error.square().sum(-1).mean()
         norm = torch.linalg.vector_norm(residual, dim=-1).mean()
         return TensorDict(
@@ -120,12 +123,17 @@ class DynamicsLoss(LossModule):
         action, _ = task.acting(registers, tensordict.get(keys.action))
         return state, action, task.split(task.locate(following))[0]
 
+    def time_step(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Return the time step of each transition ``[*batch, 1]``; ``None`` for the task's."""
+        return tensordict.get(self.tensor_keys.time_step, None)
+
     def terms(
         self,
         state: Tensor,
         action: Tensor,
         next_state: Tensor,
         penalised_action: Tensor | None = None,
+        time_step: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return the scaled terms of the two losses: ``s' - ŝ'`` and F^r, each ``[*batch, n]``.
 
@@ -135,16 +143,20 @@ class DynamicsLoss(LossModule):
             next_state: next states ``[*batch, n]``.
             penalised_action: the actions at which F^r is evaluated, ``[*batch, m]``. Defaults to
                 ``action``.
+            time_step: seconds, ``[*batch, 1]``. Defaults to the time step of the task.
         """
-        error = self.prediction_error(state, action, next_state) / self.error_scale
+        error = self.prediction_error(state, action, next_state, time_step) / self.error_scale
         if self.dynamics.residual is None:
             return error, torch.zeros_like(error)
         action = action if penalised_action is None else penalised_action
         return error, self.dynamics.residual(state, action) / self.residual_scale
 
-    def prediction_error(self, state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+    def prediction_error(
+        self, state: Tensor, action: Tensor, next_state: Tensor, time_step: Tensor | None = None
+    ) -> Tensor:
         """``s' - ŝ'`` ``[*batch, n]``, with differences of angles in [-pi, pi)."""
-        return self.dynamics.task.difference(next_state, self.dynamics.step(state, action))
+        predicted = self.dynamics.step(state, action, time_step)
+        return self.dynamics.task.difference(next_state, predicted)
 
     @torch.no_grad()
     def update_lambda(self, loss_prediction: Tensor) -> None:
@@ -160,11 +172,12 @@ class DynamicsLoss(LossModule):
         Args:
             tensordict: transitions of any batch shape.
         """
-        state, action, next_state = self.transitions(tensordict.reshape(-1))
-        task = self.dynamics.task
-        rate = task.difference(next_state, state) / task.time_step
+        tensordict = tensordict.reshape(-1)
+        state, action, next_state = self.transitions(tensordict)
+        task, seconds = self.dynamics.task, self.time_step(tensordict)
+        rate = task.difference(next_state, state) / (task.time_step if seconds is None else seconds)
         size = spread(rate)
-        self.error_scale.copy_(size * task.time_step)
+        self.error_scale.copy_(size * (task.time_step if seconds is None else seconds.mean()))
         self.residual_scale.copy_(size)
         set_scales = getattr(self.dynamics.residual, "set_scales", None)
         if callable(set_scales):

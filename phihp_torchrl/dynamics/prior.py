@@ -64,15 +64,21 @@ class PhysicsPrior(nn.Module):
 
     def constants(self) -> dict[str, Tensor]:
         """Return the current values of the constants by name, each a scalar."""
-        raw = self.log_constants
-        values = dict(zip(self.learned, raw.exp().unbind(), strict=True))
-        for i, name in enumerate(self.learned):
-            c = self.ranges[name]
-            if c.bounded:
-                values[name] = c.low + (c.high - c.low) * raw[i].sigmoid()
+        return self.decode(self.log_constants)
+
+    def decode(self, raw: Tensor) -> dict[str, Tensor]:
+        """The constants that belong to parameters ``[*batch, p]``, each ``[*batch]``.
+
+        A fixed constant is a scalar. There is one parameter for each of :attr:`learned`.
+        """
+        values = dict(zip(self.learned, raw.unbind(-1), strict=True))
         for name, c in self.ranges.items():
             if c.fixed:
                 values[name] = raw.new_tensor(c.guess)
+            elif c.bounded:
+                values[name] = c.low + (c.high - c.low) * values[name].sigmoid()
+            else:
+                values[name] = values[name].exp()
         return {name: values[name] for name in self.ranges}
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:

@@ -98,9 +98,12 @@ class ResidualMLP(nn.Module):
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """F^r: ``[*batch, n], [*batch, m] -> [*batch, n]``."""
         inputs = torch.cat([self.system.observe(state), action], -1) * self.input_scale
-        values = (self.network(inputs) * self.output_scale).unbind(-1)
-        zero = torch.zeros_like(state[..., 0])
-        columns = dict(zip(self.outputs, values, strict=True))
+        return self._spread_out(self.network(inputs) * self.output_scale)
+
+    def _spread_out(self, values: Tensor) -> Tensor:
+        """Outputs ``[..., outputs]`` in their places among the components, ``[..., n]``."""
+        columns = dict(zip(self.outputs, values.unbind(-1), strict=True))
+        zero = torch.zeros_like(values[..., 0])
         return torch.stack([columns.get(i, zero) for i in range(self.system.state_dim)], -1)
 
     @torch.no_grad()

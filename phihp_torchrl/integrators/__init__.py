@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from phihp_torchrl.config import ConfigError, Registry, check_choice, check_count
@@ -72,6 +73,22 @@ def integrator_of(config: Any) -> Integrator:
     """
     settings = {"substeps": config.substeps} if config.substeps > 1 else {}
     return make_integrator(config.integrator, **settings)
+
+
+def integrator_mapping(integrator: Integrator) -> dict[str, Any]:
+    """Write an integrator as plain values; :func:`read_integrator` makes an equal one."""
+    return {"name": integrator.name, **integrator.settings}
+
+
+def read_integrator(mapping: Mapping[str, Any]) -> Integrator:
+    """Make the integrator that :func:`integrator_mapping` has written.
+
+    Examples:
+        >>> str(read_integrator({"name": "rk4", "substeps": 2}))
+        'rk4 (substeps 2)'
+    """
+    settings = dict(mapping)
+    return make_integrator(settings.pop("name"), **settings)
 
 
 def has_substeps(integrator: str) -> bool:

@@ -17,6 +17,8 @@ Derivative = Callable[[Tensor], Tensor]
 """A vector field ``state [*batch, n] -> ds/dt [*batch, n]``, for an action that is held."""
 Impulse = Callable[[int, Tensor], Tensor]
 """``pair, state [*batch, n] -> [*batch, n]``: how the velocities change, per change of that one."""
+TimeStep = float | Tensor
+"""Seconds: a number, or a tensor ``[*batch, 1]``."""
 
 
 @dataclass(frozen=True)
@@ -162,14 +164,21 @@ class Integrator(abc.ABC):
 
     @abc.abstractmethod
     def __call__(
-        self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
+        self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
-        """Return the state ``time_step`` seconds after ``state`` ``[*batch, n]``, same shape."""
+        """Return the state ``time_step`` seconds after ``state`` ``[*batch, n]``, same shape.
+
+        The time step is a number, or a tensor ``[*batch, 1]`` with one for each state.
+        """
 
     @property
     def settings(self) -> dict[str, Any]:
         """The arguments that make an equal one: ``make_integrator(name, **settings)``."""
         return dict(vars(self))
+
+    def __str__(self) -> str:
+        told = ", ".join(f"{name} {value:g}" for name, value in self.settings.items())
+        return f"{self.name} ({told})" if told else self.name
 
 
 class FixedStepIntegrator(Integrator):
@@ -188,7 +197,7 @@ class FixedStepIntegrator(Integrator):
         check_count(self, "substeps")
 
     def __call__(
-        self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
+        self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
         for _ in range(self.substeps):
             state = self.step(derivative, state, time_step / self.substeps, layout)
@@ -196,6 +205,6 @@ class FixedStepIntegrator(Integrator):
 
     @abc.abstractmethod
     def step(
-        self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
+        self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
         """Return the state one solver step of ``time_step`` seconds later, same shape."""

@@ -7,7 +7,7 @@ from torch import Tensor
 from torchdiffeq import odeint
 
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.integrators.base import Derivative, Integrator, StateLayout
+from phihp_torchrl.integrators.base import Derivative, Integrator, StateLayout, TimeStep
 
 
 class Dopri5(Integrator):
@@ -45,18 +45,20 @@ class Dopri5(Integrator):
         self.atol = atol
 
     def __call__(
-        self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
+        self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
-        times = torch.tensor([0.0, time_step], dtype=state.dtype, device=state.device)
+        # Time steps that differ are brought to the same unit interval by the speed of the motion.
+        length, speed = (1.0, time_step) if isinstance(time_step, Tensor) else (time_step, 1.0)
+        times = torch.tensor([0.0, length], dtype=state.dtype, device=state.device)
         try:
             trajectory = odeint(
-                lambda _, s: derivative(s),
+                lambda _, s: speed * derivative(s),
                 state,
                 times,
                 method="dopri5",
                 rtol=self.rtol,
                 atol=self.atol,
-                options={"min_step": 0.01 * time_step},
+                options={"min_step": 0.01 * length},
             )
         except AssertionError as error:  # torchdiffeq raises these for non-finite values
             raise ValueError(f"state: expected finite values while solving; {error}.") from error

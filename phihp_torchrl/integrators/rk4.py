@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from phihp_torchrl.integrators.base import Derivative, FixedStepIntegrator, StateLayout
+from phihp_torchrl.integrators.base import Derivative, FixedStepIntegrator, StateLayout, TimeStep
 
 
 class RK4(FixedStepIntegrator):
@@ -25,7 +25,7 @@ class RK4(FixedStepIntegrator):
     name = "rk4"
 
     def step(
-        self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
+        self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
         half = 0.5 * time_step
         k1 = derivative(state)

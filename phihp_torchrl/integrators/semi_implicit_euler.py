@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from phihp_torchrl.integrators.base import Derivative, FixedStepIntegrator, StateLayout
+from phihp_torchrl.integrators.base import Derivative, FixedStepIntegrator, StateLayout, TimeStep
 
 
 class SemiImplicitEuler(FixedStepIntegrator):
@@ -34,8 +34,10 @@ class SemiImplicitEuler(FixedStepIntegrator):
     name = "semi_implicit_euler"
 
     def step(
-        self, derivative: Derivative, state: Tensor, time_step: float, layout: StateLayout
+        self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
+        if isinstance(time_step, Tensor):
+            time_step = time_step.expand(*state.shape[:-1], 1)[..., 0]  # that of one component
         old = state.unbind(-1)
         rate = derivative(state).unbind(-1)
         new = [s + time_step * r for s, r in zip(old, rate, strict=True)]

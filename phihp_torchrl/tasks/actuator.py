@@ -110,6 +110,11 @@ class Actuator:
         depth, slewing, lagging = self._sizes(count)
         return depth * count + len(slewing) + len(lagging)
 
+    def memory(self, time_step: float) -> float:
+        """Seconds after which the commands before have next to no effect: dead time and 4 lags."""
+        delays, lags = (v if isinstance(v, tuple) else (v,) for v in (self.delay_steps, self.lag))
+        return math.ceil(max(delays)) * time_step + 4.0 * max(lags)
+
     def rest(self, command: Tensor) -> Tensor:
         """Registers ``[*batch, r]`` after ``command`` ``[*batch, m]`` has been held for long."""
         depth, slewing, lagging = self._sizes(command.shape[-1])

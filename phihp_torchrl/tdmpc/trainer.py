@@ -314,4 +314,4 @@ def _build(context: Context) -> Phase:
     )
 
 
-register_phase("tdmpc", TDMPCTrainConfig, _build, unit="steps")
+register_phase("tdmpc", TDMPCTrainConfig, _build, unit="steps", needs_env=True)

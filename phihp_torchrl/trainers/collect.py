@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -13,6 +14,11 @@ from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.planners import CEMConfig, make_planner
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.exploration import Exploration, ExplorationConfig
+
+_log = logging.getLogger(__name__)
+
+_TOO_MANY = 0.2
+"""The largest share of real steps that may be left out of a collection."""
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
 
@@ -110,6 +116,58 @@ def random_policy(
         return tensordict.set("action", action)
 
     return policy
+
+
+def steady(task: Task, policy: Policy) -> Policy:
+    """Make a policy that repeats its last action while the observation is not finite."""
+    last = task.bounds.center
+
+    def guarded(tensordict: TensorDictBase) -> TensorDictBase:
+        nonlocal last
+        if not tensordict["observation"].isfinite().all():
+            return tensordict.set("action", last.clone())
+        tensordict = policy(tensordict)
+        last = tensordict["action"].detach()
+        return tensordict
+
+    return guarded
+
+
+def drop_unusable(data: TensorDict) -> tuple[TensorDict, int]:
+    """Leave out real transitions of which a number is missing or infinite, and warn.
+
+    Args:
+        data: transitions ``[N]`` in order, with ``"done"`` under ``"next"``.
+
+    Returns:
+        The other transitions, in which one before a gap is ``"done"``; and how many were left out.
+
+    Raises:
+        ConfigError: if they are more than a fifth.
+    """
+    keys = ("observation", "action", ("next", "observation"), ("next", "reward"))
+    usable = torch.stack([data[key].isfinite().all(-1) for key in keys]).all(0)
+    dropped = int((~usable).sum())
+    if not dropped:
+        return data, 0
+    bad = [str(key) for key in keys if not data[key].isfinite().all()]
+    if dropped > _TOO_MANY * len(data):
+        raise ConfigError(
+            "world",
+            f"{dropped} of {len(data)} real steps have missing or infinite numbers in {bad}, more "
+            f"than {_TOO_MANY:.0%}; look at the sensor or the environment.",
+        )
+    _log.warning(
+        "%d of %d real steps are left out: missing or infinite numbers in %s.",
+        dropped,
+        len(data),
+        bad,
+    )
+    done = data["next", "done"].clone()
+    done[:-1] |= ~usable[1:, None]
+    data = data.clone(recurse=False)
+    data["next"] = data["next"].clone(recurse=False).set("done", done)
+    return data[usable], dropped
 
 
 def planning_policy(

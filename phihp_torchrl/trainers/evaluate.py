@@ -21,6 +21,8 @@ from phihp_torchrl.worlds import GuardedWorld, World, crossings_text
 
 _log = logging.getLogger(__name__)
 
+_log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class EvaluateConfig:
@@ -69,7 +71,7 @@ class EvaluatePhase:
         agent: the agent.
         config: settings of the run.
         settings: the section of this phase.
-        world: the world in which the agent plays.
+        world: the world in which the agent plays; in one of recordings it is saved alone.
         directory: directory of the run, for agent, pictures and ``evaluation.json``.
         samples: real steps that were taken to train the agent.
     """
@@ -92,9 +94,9 @@ class EvaluatePhase:
         self.results: dict[str, dict[str, Any]] = {}
         self.new_files: list[NewFile] = []
         self._steps: list[tuple[str, Agent]] = []
-        if agent.planner is not None:
+        if agent.planner is not None and world.has_env:
             self._steps.append(("planner", agent))
-        if agent.actor is not None:
+        if agent.actor is not None and world.has_env:
             self._steps.append(("actor", agent.actor_alone()))
         self._finished = False
 
@@ -114,7 +116,13 @@ class EvaluatePhase:
         if len(self.results) < len(self._steps):
             return self._evaluate(*self._steps[len(self.results)])
         self._save()
-        self._show()
+        if self.world.has_env:
+            self._show()
+        else:
+            _log.warning(
+                "%s has recordings alone: the agent is saved without having played in it.",
+                self.world,
+            )
         self._finished = True
         return {}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -21,21 +21,33 @@ from phihp_torchrl.config import (
     check_widths,
 )
 from phihp_torchrl.dynamics import (
+    AUTO,
     BLOCK,
     RESIDUAL_OUTPUTS,
+    SOLVERS,
     DynamicsLoss,
     FitConfig,
+    FitReport,
     HybridDynamics,
     PhysicsPrior,
+    constants_covariance,
     fit,
+    fit_solver,
     perturbed_constants,
     rollout_error,
     split,
 )
 from phihp_torchrl.imagination import Batch
 from phihp_torchrl.integrators import check_integrator, has_substeps, integrator_of
+from phihp_torchrl.recordings import transitions
 from phihp_torchrl.tasks import Task
-from phihp_torchrl.trainers.collect import CollectConfig, planning_policy, random_policy
+from phihp_torchrl.trainers.collect import (
+    CollectConfig,
+    drop_unusable,
+    planning_policy,
+    random_policy,
+    steady,
+)
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.exploration import Exploration
 from phihp_torchrl.trainers.phases import Phase, register_phase
@@ -50,6 +62,9 @@ from phihp_torchrl.worlds import (
 
 _log = logging.getLogger(__name__)
 
+_SAME_STEP = 1e-3
+"""Recorded time steps within this share of the task's are the task's."""
+
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
 
 
@@ -58,7 +73,8 @@ class ModelConfig:
     """Settings of phase 1, which learns the model (paper, section 4.1 and appendix C).
 
     Args:
-        real_steps: total number of real transitions; 0 is allowed for an oracle.
+        real_steps: total number of real transitions; 0 is allowed for an oracle. A recorded world
+            gives all that it has.
         steps_per_iteration: real transitions between two fits, T; null for a tenth of all of them,
             but at least 50.
         kind: hybrid (prior + residual), data_driven (no prior), prior (no residual) or oracle (the
@@ -69,8 +85,11 @@ class ModelConfig:
         activation: activation of the residual: relu, tanh or silu.
         residual_outputs: components that the residual corrects, velocities (accelerations only) or
             all (every component of ds/dt).
-        integrator: integrator of the model, semi_implicit_euler, rk4 or dopri5.
-        substeps: solver steps in a control step; 1 for dopri5, which chooses its steps.
+        ensemble: number of residual networks; with more than one, each imagined life has one of
+            them and plans use their mean. The time of a fit is proportional to it.
+        integrator: integrator of the model, semi_implicit_euler, rk4 or dopri5; or auto, for the
+            cheapest one with fixed steps that predicts held-out transitions about as well as any.
+        substeps: solver steps in a control step; 1 for dopri5 and auto, which choose their steps.
         lambda_0: initial λ of the published loss, which divides the weight of ‖F^r‖.
         tau_ph: growth of λ with the prediction error.
         warm_start: whether a fit starts from the previous one. The fits between the first and the
@@ -95,7 +114,8 @@ class ModelConfig:
     hidden_sizes: tuple[int, ...] = (16, 16)
     activation: str = "tanh"
     residual_outputs: str = "velocities"
-    integrator: str = "semi_implicit_euler"
+    ensemble: int = 1
+    integrator: str = AUTO
     substeps: int = 1
     lambda_0: float = 1e3
     tau_ph: float = 1e3
@@ -109,10 +129,19 @@ class ModelConfig:
         check_count(self, "real_steps", least=0 if self.kind == "oracle" else 1)
         if self.steps_per_iteration is not None:
             check_count(self, "steps_per_iteration")
-        check_count(self, "refit_steps")
+        check_count(self, "refit_steps", "ensemble")
+        if self.ensemble > 1 and self.kind not in ("hybrid", "data_driven"):
+            raise ConfigError(
+                "ensemble",
+                f"expected 1 for a model of kind {self.kind!r}, which has no residual, "
+                f"got {self.ensemble}.",
+            )
         check_choice(self, "residual_outputs", RESIDUAL_OUTPUTS)
         check_choice(self, "activation", _ACTIVATIONS)
-        check_integrator(self)
+        if self.integrator != AUTO:
+            check_integrator(self)
+        elif self.substeps != 1:
+            raise ConfigError("substeps", f"expected 1 for {AUTO}, got {self.substeps}.")
         check_widths(self, "hidden_sizes")
         check_positive(self, "lambda_0")
         check_not_negative(self, "tau_ph")
@@ -121,7 +150,7 @@ class ModelConfig:
                 "constants_error",
                 f"expected a relative error in [0, 1), got {self.constants_error}.",
             )
-        chooses = not has_substeps(self.integrator)
+        chooses = self.integrator != AUTO and not has_substeps(self.integrator)
         if self.kind != "oracle" and self.fit.method != "adam" and chooses:
             raise ConfigError(
                 "fit.method",
@@ -162,11 +191,16 @@ def make_dynamics(
                 "model.kind", f"expected another than 'oracle': {world} has no truth to plan with."
             )
         return world.oracle()
-    integrator = integrator_of(config)
+    # The cheapest is the first that is tried (fit_solver).
+    integrator = SOLVERS[0] if config.integrator == AUTO else integrator_of(config)
     activation, sizes = _ACTIVATIONS[config.activation], config.hidden_sizes
     if config.kind == "data_driven":
         return HybridDynamics.data_driven(
-            task, hidden_sizes=sizes, activation=activation, integrator=integrator
+            task,
+            hidden_sizes=sizes,
+            activation=activation,
+            integrator=integrator,
+            ensemble=config.ensemble,
         )
     guess = _first_guess(world, config.constants_error, generator)
     if config.kind == "prior":
@@ -178,6 +212,7 @@ def make_dynamics(
         activation=activation,
         residual_outputs=config.residual_outputs,
         integrator=integrator,
+        ensemble=config.ensemble,
     )
 
 
@@ -195,7 +230,11 @@ class ModelTrainer:
     """Phase 1: learns the model from real steps (paper, section 4.1 and appendix C).
 
     It alternates between collecting real steps, at random in the first iteration and by planning
-    in later ones, and fitting the model.
+    in later ones, and fitting the model. In a world that has recordings alone, it fits the model
+    once, to all their transitions.
+
+    Steps of which a number is missing are left out, with a warning. A run saves new steps before it
+    fits the model to them, so that a fit that fails costs no step.
 
     Args:
         task: the task.
@@ -226,31 +265,45 @@ class ModelTrainer:
         self.world = make_world(task, world)
         self.exploration = Exploration(task, config.collect.exploration)
         self.crossings: Counter[str] = Counter()
-        guards = config.collect.exploration.guards
-        self.env = guard_env(self.world.make_env(), task, guards, self.crossings)
+        self.env = None
+        if self.world.has_env:
+            guards = config.collect.exploration.guards
+            self.env = guard_env(self.world.make_env(), task, guards, self.crossings)
+        self.recorded = _recorded(self.world)
         self.generator = torch.Generator().manual_seed(seed)
         self.dynamics = make_dynamics(self.world, config, self.generator)
         self.initial = {k: v.clone() for k, v in self.dynamics.state_dict().items()}
         self.loss = DynamicsLoss(self.dynamics, lambda_0=config.lambda_0, tau_ph=config.tau_ph)
         self.data: TensorDict | None = None
         self.iteration = 0
+        self.keep: Callable[[], None] | None = None
+        """What saves the run; it is called when there are new real steps."""
+        self._new, self._dropped = 0, 0  # steps not yet fitted, and those left out
         self._told: set[str] = set()
-        self.env.set_seed(self._draw_seed())
+        seed_of_env = self._draw_seed()
+        if self.env is not None:
+            self.env.set_seed(seed_of_env)
 
     @property
     def real_steps(self) -> int:
-        """Real transitions so far."""
-        return 0 if self.data is None else len(self.data)
+        """Real steps so far, with those that were left out."""
+        return self._dropped + (0 if self.data is None else len(self.data))
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Real transitions so far and in all."""
-        return self.real_steps, self.config.real_steps
+        """Real steps so far and in all."""
+        total = self.config.real_steps if self.recorded is None else len(self.recorded)
+        return self.real_steps, total
 
     @property
     def done(self) -> bool:
         """Whether all real transitions are collected and fitted."""
-        return self.real_steps >= self.config.real_steps
+        return self._has_all and not self._new
+
+    @property
+    def _has_all(self) -> bool:
+        steps, total = self.progress
+        return steps >= total
 
     def states(self) -> Tensor:
         """Return all states of the real data, ``[N, n]``."""
@@ -269,26 +322,53 @@ class ModelTrainer:
         terminated = self.task.is_terminated(next_state)
         return Batch(state, action, self.data["next", "reward"][:, 0], next_state, terminated)
 
+    def constants_covariance(self) -> Tensor:
+        """Covariance of the prior's learned constants after the last fit, ``[learned, learned]``.
+
+        Raises:
+            ConfigError: before the first fit, and as
+                :func:`~phihp_torchrl.dynamics.constants_covariance`.
+        """
+        if self.data is None:
+            raise ConfigError("real_steps", "expected real steps that were fitted, got none.")
+        train, held_out, _ = split(self.data)
+        return constants_covariance(self.loss, train, held_out)
+
     def parts(self) -> dict[str, Any]:
         """Return the model, as an argument of :class:`~phihp_torchrl.Agent`."""
         return {"dynamics": self.dynamics}
 
     def advance(self) -> dict[str, float]:
         """Collect once and fit once; returns metrics."""
-        steps = min(self.config.period, self.config.real_steps - self.real_steps)
-        new = self.collect(steps)
-        self.data = new if self.data is None else torch.cat([self.data, new])
-        self.iteration += 1
+        if not self._new:  # else a fit has failed, and is tried again on the same steps
+            steps = min(self.config.period, self.config.real_steps - self.real_steps)
+            new = self.collect(steps) if self.recorded is None else self.recorded
+            self.data = new if self.data is None else torch.cat([self.data, new])
+            self.iteration += 1
+            self._new = len(new)
+            if self.keep is not None:
+                self.keep()
+        assert self.data is not None
         self._tell_disagreements()
-        metrics = {"real_steps": self.real_steps, "collect/reward": new["next", "reward"].mean()}
+        reward = self.data["next", "reward"][-self._new :].mean()
+        metrics = {"real_steps": self.real_steps, "collect/reward": reward}
         if self.config.collect.exploration.guards:
             metrics["collect/guard_crossings"] = self.crossings.total()
+        if self._dropped:
+            metrics["collect/dropped"] = self._dropped
         if self.config.kind != "oracle":
             metrics |= self.fit()
+        self._new = 0
         return {name: float(value) for name, value in metrics.items()}
 
     def collect(self, steps: int) -> TensorDict:
-        """Take real steps: at random in the first iteration, with the planner in later ones."""
+        """Take real steps: at random in the first iteration, with the planner in later ones.
+
+        Raises:
+            ConfigError: for a world of recordings, and if too many steps miss a number.
+        """
+        if self.env is None:
+            raise ConfigError("world", f"{self.world} has recordings alone, nobody can act in it.")
         config, generator = self.config, self.generator
         if self.iteration == 0:
             policy = random_policy(self.task, config.collect, generator, self.exploration)
@@ -302,11 +382,12 @@ class ModelTrainer:
         self.env.set_seed(self._draw_seed())
         self.crossings.clear()
         with torch.no_grad():
+            policy = steady(self.task, policy)
             rollout = self.env.rollout(steps, policy, break_when_any_done=False)
         self._tell_crossings(steps)
         done = rollout["next", "done"].clone()
         done[-1] = True  # the next rollout starts from a reset
-        return TensorDict(
+        data = TensorDict(
             observation=rollout["observation"].float(),
             action=rollout["action"].float(),
             next=TensorDict(
@@ -318,6 +399,9 @@ class ModelTrainer:
             ),
             batch_size=[steps],
         ).detach()
+        data, dropped = drop_unusable(data)
+        self._dropped += dropped
+        return data
 
     def _tell_crossings(self, steps: int) -> None:
         """Warn where guards ended episodes."""
@@ -337,7 +421,7 @@ class ModelTrainer:
             return
         for sentence in disagreements(self.task, self.data):
             about = sentence.split(" of ")[0].rstrip("0123456789 ")
-            if about not in self._told or self.done:
+            if about not in self._told or self._has_all:
                 self._told.add(about)
                 _log.warning("After %d real steps: %s.", self.real_steps, sentence)
 
@@ -347,14 +431,14 @@ class ModelTrainer:
         if not self.config.warm_start:
             self.dynamics.load_state_dict(self.initial)
             self.loss.lambda_.fill_(self.config.lambda_0)
-        elif self.iteration > 1 and not self.done:
+        elif self.iteration > 1 and not self._has_all:
             config = replace(
                 config,
                 steps=min(config.steps, self.config.refit_steps),
                 initial_lambda=config.final_lambda,
             )
         train, held_out, blocks = split(self.data)
-        report = fit(self.loss, train, held_out, config, self.generator)
+        report = self._fit(train, held_out, config)
         state, action, _ = self.loss.transitions(train)
         metrics: dict[str, Tensor | float] = {
             "model/train_error": report.train_error,
@@ -372,6 +456,18 @@ class ModelTrainer:
                 metrics[f"constants/{name}"] = value.detach()
         return metrics
 
+    def _fit(self, train: TensorDict, held_out: TensorDict, config: FitConfig) -> FitReport:
+        """Fit; the first and the last time choose the integrator too, if the settings say so."""
+        chooses = self.config.integrator == AUTO and config.method == "levenberg_marquardt"
+        if not chooses or not (self.iteration == 1 or self._has_all):
+            return fit(self.loss, train, held_out, config, self.generator)
+        report, trials = fit_solver(self.loss, train, held_out, config, self.generator)
+        if len(trials) > 1:
+            tried = ", ".join(str(trial) for trial in trials)
+            solver = self.dynamics.integrator
+            _log.info("The model is integrated by %s (held-out errors: %s).", solver, tried)
+        return report
+
     def state_dict(self) -> dict[str, Any]:
         """Return the state that a resumed run needs, as tensors and numbers."""
         return {
@@ -379,7 +475,10 @@ class ModelTrainer:
             "initial": self.initial,
             "loss": {name: buffer for name, buffer in self.loss.named_buffers(recurse=False)},
             "data": None if self.data is None else self.data.to_dict(),
+            "solver": self._solver(),
             "iteration": self.iteration,
+            "new": self._new,
+            "dropped": self._dropped,
             "generator": self.generator.get_state(),
         }
 
@@ -392,10 +491,32 @@ class ModelTrainer:
         data = state["data"]
         self.data = None if data is None else TensorDict(data).auto_batch_size_(1)
         self.iteration = state["iteration"]
+        if (solver := state.get("solver")) is not None:
+            self.dynamics.integrator = SOLVERS[solver]
+        self._new, self._dropped = state.get("new", 0), state.get("dropped", 0)
         self.generator.set_state(state["generator"])
+
+    def _solver(self) -> int | None:
+        """The number of the integrator among those that are tried, if it is to be chosen."""
+        if self.config.integrator != AUTO:
+            return None
+        return next((i for i, s in enumerate(SOLVERS) if s is self.dynamics.integrator), None)
 
     def _draw_seed(self) -> int:
         return int(torch.randint(2**31, (), generator=self.generator))
+
+
+def _recorded(world: World) -> TensorDict | None:
+    """All transitions of a world that has recordings alone; ``None`` for other worlds."""
+    if world.has_env:
+        return None
+    if world.recordings is None:
+        raise ConfigError("world", f"{world} has neither an environment nor recordings.")
+    data = transitions(world.task, world.recordings)
+    # Equal time steps are the task's, for which a model is faster.
+    if torch.allclose(data["time_step"], torch.tensor(world.task.time_step), rtol=_SAME_STEP):
+        del data["time_step"]
+    return data
 
 
 def _build(context: Context) -> Phase:

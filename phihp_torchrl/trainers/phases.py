@@ -15,8 +15,9 @@ class Phase(Protocol):
 
     A phase may also have an attribute ``real_steps``, the number of real steps that it has taken; a
     method ``parts``, which returns modules as keyword arguments of :class:`~phihp_torchrl.Agent`,
-    or a whole agent as ``agent``; and an attribute ``new_files``, a list of ``(label, path)`` of
-    files for the logger.
+    or a whole agent as ``agent``; an attribute ``new_files``, a list of ``(label, path)`` of files
+    for the logger; and an attribute ``keep``, which the run sets to a function that saves a
+    checkpoint, for the phase to call within a unit of work when it has what must not be lost.
 
     Examples:
         >>> class Count:
@@ -74,12 +75,14 @@ class PhaseKind:
         build: a function that makes the phase from a :class:`~phihp_torchrl.trainers.Context`.
         unit: unit of its progress.
         needs_truth: whether it requires a simulated world.
+        needs_env: whether it requires a world in which one can act.
     """
 
     config: type[Any]
     build: Callable[[Any], Phase]
     unit: str = "units"
     needs_truth: bool = False
+    needs_env: bool = False
 
 
 PHASES: Registry[PhaseKind] = Registry("phase")
@@ -96,6 +99,7 @@ def register_phase(
     *,
     unit: str = "units",
     needs_truth: bool = False,
+    needs_env: bool = False,
     replace: bool = False,
 ) -> PhaseKind:
     """Register a phase for methods, with its settings in the section of its name.
@@ -107,6 +111,8 @@ def register_phase(
         unit: unit of its progress.
         needs_truth: whether it requires a simulated world; runs in other worlds are then refused at
             the start.
+        needs_env: whether it requires a world in which one can act; runs in a world of recordings
+            are then refused at the start.
         replace: whether a phase of that name may be replaced.
 
     Returns:
@@ -124,7 +130,9 @@ def register_phase(
         >>> register_phase("rest", RestConfig, lambda context: Rest(), replace=True).unit
         'units'
     """
-    kind = PHASES.register(name, PhaseKind(config, build, unit, needs_truth), replace=replace)
+    kind = PHASES.register(
+        name, PhaseKind(config, build, unit, needs_truth, needs_env), replace=replace
+    )
     # Sections of the package's own phases are in defaults.yaml; train.yaml includes the others.
     sections = {
         each: to_mapping(of.config())

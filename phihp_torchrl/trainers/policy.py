@@ -35,7 +35,13 @@ from phihp_torchrl.config import (
     check_positive,
     check_share,
 )
-from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
+from phihp_torchrl.dynamics import (
+    HybridDynamics,
+    PhysicsPrior,
+    TaskWorldModel,
+    draw_shifts,
+    per_life,
+)
 from phihp_torchrl.imagination import Rollouts, StartConfig, Worlds, make_start_states
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.context import Context
@@ -71,6 +77,10 @@ class PolicyConfig:
         max_seconds: duration after which the phase ends early; null for no limit.
         scales: auto to train in units measured from the task's coverage, where observations or
             values are far from the size of one; none to train in physical units.
+        draw_constants: whether every imagined world has constants of its own, drawn from the 95 %
+            interval that the fit of the model leaves them.
+        constants_std: standard deviation that takes the place of the fit's: of a free constant
+            relative, of a bounded one of the logit of its place; null for the fit's.
         start: where imagined episodes start.
         td3: hyper-parameters of TD3.
         refit: when and how the critics are fitted to the best actor's returns in the model.
@@ -102,6 +112,8 @@ class PolicyConfig:
     real_evaluation_episodes: int = 10
     max_seconds: float | None = None
     scales: str = "auto"
+    draw_constants: bool = False
+    constants_std: float | None = None
     start: StartConfig = field(default_factory=StartConfig)
     td3: TD3Config = field(default_factory=TD3Config)
     refit: RefitConfig = field(default_factory=RefitConfig)
@@ -128,7 +140,12 @@ class PolicyConfig:
                 f"expected at most replay_capacity = {self.replay_capacity}, "
                 f"got {self.random_steps}.",
             )
-        for name in ("max_age", "evaluation_steps", "max_seconds"):
+        if self.constants_std is not None and not self.draw_constants:
+            raise ConfigError(
+                "constants_std",
+                f"expected null without draw_constants=true, got {self.constants_std}.",
+            )
+        for name in ("max_age", "evaluation_steps", "max_seconds", "constants_std"):
             if getattr(self, name) is not None:
                 check_positive(self, name)
         chunk_updates = self.chunk_steps * self.updates_per_step
@@ -166,6 +183,11 @@ class PolicyTrainer(TD3Trainer):
     With ``config.scales`` the networks are trained in units that are measured from the task's
     coverage. The actors and critics that this returns, and its metrics, are in physical units.
 
+    An ensemble of residuals, and constants with ``config.draw_constants``, are dealt out to the
+    imagined worlds (:func:`~phihp_torchrl.dynamics.per_life`), also when the actor to keep is
+    chosen and the critics are fitted. So the actor kept is the one that earns most over all models
+    which the data allow.
+
     Args:
         task: the task.
         dynamics: the model to imagine with; it is not changed.
@@ -175,6 +197,11 @@ class PolicyTrainer(TD3Trainer):
             torch's global generator.
         data_states: states of real transitions ``[N, n]``, for ``start.data`` > 0.
         compile: whether to compile the TD3 step, imagination, and the fit of the critics.
+        covariance: covariance of the model's learned constants, for ``config.draw_constants``
+            without ``config.constants_std``.
+
+    Raises:
+        ConfigError: for constants to draw without their covariance, or that are not learned.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -202,10 +229,12 @@ class PolicyTrainer(TD3Trainer):
         seed: int,
         data_states: Tensor | None = None,
         compile: bool = False,
+        covariance: Tensor | None = None,
     ) -> None:
         self.task, self.config = task, config
+        self.shifts = _draw(dynamics, config, covariance, seed)
         self.start_states = make_start_states(task, config.start, states=data_states)
-        model = TaskWorldModel(task, dynamics)
+        model = TaskWorldModel(task, per_life(dynamics, self.shifts))
         self.scales = self._measure(model, seed)
         self.world_model = scaled(model, self.scales)
         super().__init__(self.world_model, config.td3, seed=seed, compile=compile)
@@ -306,6 +335,7 @@ class PolicyTrainer(TD3Trainer):
             "best_return": self.best_return,
             "evaluation_states": self._evaluation_states,
             "world_states": self._world_states,
+            **({} if self.shifts is None else {"shifts": self.shifts}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -318,6 +348,8 @@ class PolicyTrainer(TD3Trainer):
         super().load_state_dict(state)
         for kept, layer in zip(self.best, state["best"], strict=True):
             kept.copy_(layer)
+        if self.shifts is not None:
+            self.shifts.copy_(state["shifts"])  # the same to the last digit on another machine
         self.best_return = state["best_return"]
         self._evaluation_states = state["evaluation_states"]
         self._world_states = state["world_states"]
@@ -407,16 +439,41 @@ class PolicyTrainer(TD3Trainer):
                 return
 
 
+def _draw(
+    dynamics: HybridDynamics, config: PolicyConfig, covariance: Tensor | None, seed: int
+) -> Tensor | None:
+    """Shifts of the constants of each imagined world, ``[worlds, learned]``, if there are any."""
+    if not config.draw_constants:
+        return None
+    prior = getattr(dynamics, "prior", None)
+    if not isinstance(prior, PhysicsPrior) or not prior.learned:
+        raise ConfigError(
+            "policy.draw_constants", "expected false for a model without learned constants."
+        )
+    if config.constants_std is not None:
+        covariance = config.constants_std**2 * torch.eye(len(prior.learned))
+    if covariance is None:
+        raise ConfigError(
+            "policy.draw_constants",
+            "expected the covariance of the constants, or policy.constants_std, got neither.",
+        )
+    # The draws have a generator of their own, so that everything else is as without them.
+    return draw_shifts(covariance, config.num_worlds, torch.Generator().manual_seed(seed))
+
+
 def _build(context: Context) -> Phase:
     config, model = context.config, context.before["model"]
+    settings = context.settings
+    measured = settings.draw_constants and settings.constants_std is None
     return PolicyTrainer(
         context.task,
         model.dynamics,
-        context.settings,
+        settings,
         world=context.world,
         seed=config.seed,
         data_states=model.states(),
         compile=config.compile,
+        covariance=model.constants_covariance() if measured else None,
     )
 
 

@@ -21,6 +21,8 @@ def read_result(path: Path) -> TaskResult | None:
     if not directory.evaluation.is_file():
         return None
     results = json.loads(directory.evaluation.read_text())
+    if not results:  # a world in which nobody can act
+        return None
     means = {name: (result["return_mean"],) for name, result in results.items()}
     samples = directory.read_metadata()["real_steps"]
     method = METHODS.get(config.get("method", "phihp"))

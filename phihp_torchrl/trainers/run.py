@@ -7,6 +7,7 @@ import random
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +150,8 @@ class _Run:
                     )
                     continue
                 self._resume_phase(name, phase)
+                if hasattr(phase, "keep"):
+                    phase.keep = partial(self._save, name, phase)
                 if table is None:
                     table, logger = self._open_logs(metadata)
                 finished = self._advance(name, phase, table, logger)

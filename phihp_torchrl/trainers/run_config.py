@@ -22,6 +22,7 @@ from phihp_torchrl.config import (
     to_mapping,
 )
 from phihp_torchrl.evaluation import check_training_seed
+from phihp_torchrl.integrators import has_substeps
 from phihp_torchrl.planners import PLANNERS, CEMConfig, SearchConfig
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.trainers.loggers import LoggerConfig
@@ -298,7 +299,8 @@ def check_run(config: RunConfig, world: World) -> None:
     """Refuse settings that the task or the world of a run cannot serve, before any real step.
 
     Raises:
-        ConfigError: if the system has no prior or the world is not simulated, where one is needed.
+        ConfigError: if the system has no prior or the world is not simulated, where one is needed,
+            and for constants to draw where none are learned.
     """
     task = world.task
     kind = getattr(config.sections.get("model"), "kind", None)
@@ -309,6 +311,16 @@ def check_run(config: RunConfig, world: World) -> None:
             f"of task {task.name!r}, {type(task.system).__name__}, has none; expected "
             "'data_driven' or a method that needs none.",
         )
+    if not world.has_env:
+        phases = [name for name in config.phases_to_do if PHASES[name].needs_env]
+        if phases:
+            raise ConfigError(
+                "method",
+                f"expected one that does without acting in the world, {config.method!r} acts in it "
+                f"in {phases}, and {world} has recordings alone.",
+            )
+    if getattr(config.sections.get("policy"), "draw_constants", False):
+        _check_drawing(config, task)
     if world.truth is None:
         phases = [name for name in config.phases_to_do if PHASES[name].needs_truth]
         if phases:
@@ -321,3 +333,21 @@ def check_run(config: RunConfig, world: World) -> None:
             raise ConfigError(
                 "model.kind", f"expected another than 'oracle': {world} has no truth to plan with."
             )
+
+
+def _check_drawing(config: RunConfig, task: Task) -> None:
+    """Refuse to draw constants where none are learned, or their fit gives no covariance."""
+    model = config.section("model")
+    learned = [name for name, c in task.system.ranges.items() if not c.fixed]
+    if model.kind not in ("hybrid", "prior") or not learned:
+        raise ConfigError(
+            "policy.draw_constants",
+            f"expected false for a model of kind {model.kind!r} of a system that has "
+            f"{len(learned)} constants to learn: there are none to draw.",
+        )
+    if not has_substeps(model.integrator) and config.section("policy").constants_std is None:
+        raise ConfigError(
+            "policy.constants_std",
+            f"expected a number with draw_constants=true and model.integrator={model.integrator}, "
+            "whose fit has no covariance.",
+        )

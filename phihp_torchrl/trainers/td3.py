@@ -236,4 +236,4 @@ def _build(context: Context) -> Phase:
     )
 
 
-register_phase("td3", RealTD3Config, _build, unit="steps", needs_truth=True)
+register_phase("td3", RealTD3Config, _build, unit="steps", needs_truth=True, needs_env=True)

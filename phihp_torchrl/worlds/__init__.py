@@ -1,4 +1,4 @@
-"""Worlds, the source of real steps: simulated, gymnasium's, or any TorchRL environment."""
+"""Worlds, the source of real steps: simulated, gymnasium's, TorchRL's, or recordings."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from phihp_torchrl.worlds.guards import (
     read_guards,
 )
 from phihp_torchrl.worlds.gymnasium import GymnasiumConfig, GymnasiumWorld
+from phihp_torchrl.worlds.recorded import RecordedConfig, RecordedWorld
 from phihp_torchrl.worlds.registry import (
     WORLDS,
     GivenConfig,
@@ -37,6 +38,8 @@ __all__ = [
     "GymnasiumConfig",
     "GymnasiumWorld",
     "Plant",
+    "RecordedConfig",
+    "RecordedWorld",
     "SimulatedConfig",
     "SimulatedWorld",
     "TaskEnv",

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torchrl.envs import EnvBase
 
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.recordings import Recording
 from phihp_torchrl.tasks import Task
 
 if TYPE_CHECKING:
@@ -40,6 +41,8 @@ class World(ABC):
 
     kind: ClassVar[str]
     """The name that settings use."""
+    has_env: ClassVar[bool] = True
+    """Whether one can act in it; a world without an environment has :attr:`recordings`."""
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -54,6 +57,11 @@ class World(ABC):
         Args:
             render: whether :meth:`picture` will be called with the environment.
         """
+
+    @property
+    def recordings(self) -> list[Recording] | None:
+        """What was recorded, of a world in which one cannot act; ``None`` for other worlds."""
+        return None
 
     def picture(self, env: EnvBase) -> NDArray[Any] | None:
         """Draw the current state, ``[height, width, 3]`` uint8; ``None`` if the world cannot.

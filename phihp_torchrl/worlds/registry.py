@@ -10,9 +10,11 @@ import gymnasium
 from torchrl.envs import EnvBase, GymWrapper
 
 from phihp_torchrl.config import ConfigError, Registry, default_of, offer, read_kind
+from phihp_torchrl.recordings import RecordedData, Recording
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.gymnasium import GymnasiumConfig, GymnasiumWorld
+from phihp_torchrl.worlds.recorded import RecordedConfig, RecordedWorld
 from phihp_torchrl.worlds.simulated import SimulatedConfig, SimulatedWorld
 from phihp_torchrl.worlds.torchrl import EnvWorld, TorchRLConfig
 
@@ -78,7 +80,7 @@ def make_world(task: str | Task, world: Any = "simulated") -> World:
         task: a task, or the name of a registered one.
         world: the name of a kind of world, a mapping of its settings with their ``kind``, a
             dataclass of its settings, a TorchRL or gymnasium environment, a function that makes
-            one, or a :class:`World`.
+            one, recordings, or a :class:`World`.
 
     Raises:
         ConfigError: for a kind that is not registered, settings that it does not have, or a
@@ -103,6 +105,10 @@ def make_world(task: str | Task, world: Any = "simulated") -> World:
         world = {"kind": world}
     if isinstance(world, Mapping):
         world = read_kind(WORLDS, world, "world")
+    if isinstance(world, Recording):
+        world = [world]
+    if isinstance(world, RecordedData) or _are_recordings(world):
+        return RecordedWorld(task, world)
     if isinstance(world, gymnasium.Env):
         world = GymWrapper(world)
     kind = getattr(type(world), "kind", "")
@@ -112,9 +118,14 @@ def make_world(task: str | Task, world: Any = "simulated") -> World:
         return EnvWorld(task, world, label=getattr(world, "__name__", type(world).__name__))
     raise ConfigError(
         "world",
-        f"expected one of {sorted(WORLDS)}, settings, an environment or a function that makes one, "
-        f"got {world!r}.",
+        f"expected one of {sorted(WORLDS)}, settings, an environment, a function that makes one or "
+        f"recordings, got {world!r}.",
     )
+
+
+def _are_recordings(world: Any) -> bool:
+    listed = isinstance(world, (list, tuple)) and bool(world)
+    return listed and all(isinstance(each, Recording) for each in world)
 
 
 @dataclass(frozen=True)
@@ -148,6 +159,12 @@ register_world(
     TorchRLConfig,
     EnvWorld.from_config,
     about="any TorchRL environment: world=torchrl world.make=module:function",
+)
+register_world(
+    RecordedConfig.kind,
+    RecordedConfig,
+    RecordedWorld.from_config,
+    about="recordings alone: world=recorded world.files=logs/*.csv",
 )
 register_world(
     GivenConfig.kind,

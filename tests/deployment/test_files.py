@@ -33,6 +33,7 @@ def kinds(task):
         "hybrid": HybridDynamics.hybrid(task, hidden_sizes=(5, 6, 7), constants={}),
         "all outputs": HybridDynamics.hybrid(task, residual_outputs="all", integrator="rk4"),
         "substeps": HybridDynamics.hybrid(task, integrator=make_integrator("rk4", substeps=3)),
+        "ensemble": HybridDynamics.hybrid(task, hidden_sizes=(5, 4), ensemble=3),
         "tolerances": HybridDynamics.pure_prior(task, integrator=Dopri5(rtol=1e-3)),
         "data-driven": HybridDynamics.data_driven(task, hidden_sizes=(4,)),
         "pure prior": HybridDynamics.pure_prior(task),

@@ -231,3 +231,19 @@ def test_what_cannot_be_chosen_is_named():
         make_integrator("dopri5", substeps=2)
     with pytest.raises(ConfigError, match=r"^integrator: 'rk4' has no such settings: .*rtol"):
         make_integrator("rk4", rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["semi_implicit_euler", "rk4", "dopri5"])
+def test_time_steps_that_differ_are_integrated_as_such(name: str) -> None:
+    integrator = make_integrator(name)
+    layout = StateLayout(size=2, pairs=((0, 1),), limits=(math.inf,))
+    state = torch.randn(2, 5, 2, dtype=torch.float64)
+    seconds = 0.01 + 0.1 * torch.rand(2, 5, 1, dtype=torch.float64)
+
+    def swing(s: torch.Tensor) -> torch.Tensor:
+        return torch.stack([s[..., 1], -s[..., 0].sin()], -1)
+
+    together = integrator(swing, state, seconds, layout)
+    for i, j in ((0, 0), (1, 3)):
+        alone = integrator(swing, state[i, j], seconds[i, j].item(), layout)
+        assert torch.allclose(together[i, j], alone, atol=1e-6)

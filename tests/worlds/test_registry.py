@@ -95,7 +95,7 @@ def test_settings_reach_the_world():
     [
         (
             "magic",
-            r"world: expected one of \['given', 'gymnasium', 'simulated', 'torchrl'.*'magic'",
+            r"world: expected one of \['given', 'gymnasium', 'recorded', 'simulated', .*'magic'",
         ),
         ({"kind": "magic"}, r"world\.kind: expected one of .*'magic'"),
         ({"kind": "gymnasium"}, r"world\.id: missing"),
@@ -104,7 +104,7 @@ def test_settings_reach_the_world():
         ({"substeps": 0}, r"world\.substeps: expected a whole number"),
         ({"kind": "given"}, r"world\.kind: this run was started from Python with a world of its"),
         ("given", r"world\.kind: this run was started from Python with a world of its own"),
-        (3, r"world: expected one of .*, settings, an environment or a function that .*, got 3\."),
+        (3, r"world: expected one of .*, settings, an environment, a function that .*, got 3\."),
         (None, r"world: expected one of .*, got None\."),
     ],
 )

@@ -98,7 +98,7 @@ def test_episodes_of_dm_control_differ_by_their_seed():
 def test_shares_are_one_for_a_model_in_which_nothing_changes(steps):
     world = WORLDS["gymnasium MountainCarContinuous-v0"]
     loss = known(world, {})
-    loss.dynamics.step = lambda state, action: state
+    loss.dynamics.step = lambda state, *_: state
     data = played(world, pushed(world), 100)
     for row in shares(loss, data, world.stops)[str(steps)].values():
         del row["windows"]

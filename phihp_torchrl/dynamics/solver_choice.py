@@ -1,0 +1,130 @@
+"""The choice of a model's integrator by its held-out error."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from tensordict import TensorDictBase
+
+from phihp_torchrl.dynamics.fitting import FitConfig, FitReport, fit
+from phihp_torchrl.dynamics.loss import DynamicsLoss
+from phihp_torchrl.integrators import RK4, Integrator, SemiImplicitEuler
+
+AUTO = "auto"
+"""The name in settings of a choice by held-out error."""
+
+SOLVERS: tuple[Integrator, ...] = (
+    SemiImplicitEuler(),
+    SemiImplicitEuler(substeps=2),
+    RK4(),
+    SemiImplicitEuler(substeps=4),
+    RK4(substeps=2),
+)
+"""What is tried, by evaluations of ds/dt in a step: 1, 2, 4, 4 and 8."""
+
+_WORTH = 2.0
+"""A solver must divide the held-out error by this to be preferred to a cheaper one."""
+
+_GOOD = 1e-5
+"""A held-out error at which the cheapest solver is not questioned: 0.3 % of a step's change."""
+
+_TRIAL_STEPS = 15
+"""Optimization steps of a trial; the fit with the chosen solver takes all."""
+
+
+@dataclass(frozen=True)
+class SolverTrial:
+    """A fit with one solver.
+
+    Args:
+        integrator: the solver.
+        report: what the fit gave.
+    """
+
+    integrator: Integrator
+    report: FitReport
+
+    def __str__(self) -> str:
+        return f"{self.integrator} {self.report.held_out_error:.3g}"
+
+
+def fit_solver(
+    loss: DynamicsLoss,
+    train: TensorDictBase,
+    held_out: TensorDictBase,
+    config: FitConfig,
+    generator: torch.Generator | None = None,
+    *,
+    solvers: Sequence[Integrator] = SOLVERS,
+) -> tuple[FitReport, list[SolverTrial]]:
+    """Fit the model, with the cheapest solver that predicts about as well as any.
+
+    Imagination and planning pay for each evaluation of ds/dt, so a finer solver must at least halve
+    the held-out error of the cheaper one. Where the cheapest is good enough, no other is tried.
+    Every fit starts from the same parameters and draws the same numbers, so the result is that of
+    :func:`fit` with the chosen solver.
+
+    Args:
+        loss: the loss of the model, whose integrator is replaced.
+        train: transitions ``[N]`` to learn from.
+        held_out: transitions ``[M]`` by which the solvers are compared.
+        config: method and hyper-parameters of the fits.
+        generator: source of mini-batches. Defaults to torch's global generator.
+        solvers: the solvers, the cheapest first.
+
+    Returns:
+        What the fit with the chosen solver gave, and the trials in order.
+
+    Raises:
+        ValueError: as :func:`fit`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> task = get_task("pendulum")
+        >>> truth = HybridDynamics.pure_prior(task, integrator="rk4")
+        >>> state, action = task.coverage.sample([64]), 4 * torch.rand(64, 1) - 2
+        >>> following = TensorDict(observation=task.observe(truth(state, action)), batch_size=[64])
+        >>> data = TensorDict(
+        ...     observation=task.observe(state), action=action, next=following, batch_size=[64]
+        ... ).detach()
+        >>> loss = DynamicsLoss(HybridDynamics.pure_prior(task))
+        >>> report, trials = fit_solver(loss, data, data, FitConfig(steps=20))
+        >>> loss.dynamics.integrator.name
+        'rk4'
+    """
+    start, draws = copy.deepcopy(loss.state_dict()), _draws(generator)
+
+    def fit_with(solver: Integrator, config: FitConfig) -> FitReport:
+        loss.load_state_dict(start)
+        _set_draws(generator, draws)
+        loss.dynamics.integrator = solver
+        return fit(loss, train, held_out, config, generator)
+
+    report = fit_with(solvers[0], config)
+    if report.held_out_error <= _GOOD or len(solvers) == 1:
+        return report, [SolverTrial(solvers[0], report)]
+    short = replace(config, steps=min(config.steps, _TRIAL_STEPS))
+    trials = [SolverTrial(solver, fit_with(solver, short)) for solver in solvers]
+    return fit_with(trials[choose(trials)].integrator, config), trials
+
+
+def choose(trials: Sequence[SolverTrial]) -> int:
+    """Return the index of the cheapest trial whose error no finer one divides by :data:`_WORTH`."""
+    errors = [trial.report.held_out_error for trial in trials]
+    good = [i for i, error in enumerate(errors) if error <= _WORTH * min(errors)]
+    return good[0]
+
+
+def _draws(generator: torch.Generator | None) -> torch.Tensor:
+    return torch.get_rng_state() if generator is None else generator.get_state()
+
+
+def _set_draws(generator: torch.Generator | None, state: torch.Tensor) -> None:
+    if generator is None:
+        torch.set_rng_state(state)
+    else:
+        generator.set_state(state)

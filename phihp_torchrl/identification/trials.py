@@ -1,0 +1,102 @@
+"""Small fits, which tell one model from another by windows that they were not fitted to."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.identification.model import Model
+from phihp_torchrl.identification.settling import noise
+from phihp_torchrl.identification.shooting import Shooting, robust
+from phihp_torchrl.identification.windows import Samples, Windows, first_starts
+
+WINDOWS = 160
+"""Windows of a trial; every other one is fitted."""
+_CLEAR = 3.0
+"""Standard errors by which the mean of paired differences must be better."""
+_WORTH = 0.005
+"""Share of the error by which a richer model must be better."""
+
+
+class Trial(NamedTuple):
+    """A model that was fitted to few windows.
+
+    Args:
+        part: what it is, in words.
+        model: the model.
+        raw: its parameters ``[p]``.
+        starts: ``[W, n]``.
+        residual: fitted minus measured, in units of the states, ``[W, L, n]``.
+    """
+
+    part: str
+    model: Model
+    raw: Tensor
+    starts: Tensor
+    residual: Tensor
+
+
+class Trials:
+    """Fits models to the same few windows, and compares them.
+
+    Args:
+        samples: the recordings.
+        windows: windows of them.
+    """
+
+    def __init__(self, samples: Samples, windows: Windows) -> None:
+        self.samples, self.windows = samples, windows
+        self.teaching = torch.arange(len(windows.time)) % 2 == 0
+
+    def attempt(
+        self, part: str, model: Model, raw: Tensor, like: Trial | None = None, rounds: int = 1
+    ) -> Trial:
+        """Fit a model.
+
+        Args:
+            part: what it is, in words.
+            model: the model.
+            raw: first guess of its parameters.
+            like: an earlier trial, whose starts and noise are first guesses.
+            rounds: how often the noise is estimated anew.
+        """
+        shooting = Shooting(model, self.samples, self.windows, self.teaching)
+        starts = first_starts(model.prior.system, self.windows) if like is None else like.starts
+        if like is None:
+            sigma = noise(starts[:, None] - self.windows.measured, self.windows.mask, 0)
+            fit = shooting.fit(sigma, raw, starts, iterations=3, learn=False)
+            residual = fit.residual
+        else:
+            residual = like.residual
+        for _ in range(rounds):
+            sigma = noise(residual, self.windows.mask, len(raw) + starts.numel())
+            fit = shooting.fit(sigma, raw, starts, iterations=6)
+            raw, starts, residual = fit.raw, fit.starts, fit.residual
+        return Trial(part, model, raw, starts, residual)
+
+    def losses(self, trial: Trial, sigma: Tensor) -> Tensor:
+        """Robust loss of each window that the trial was not fitted to."""
+        judged = ~self.teaching if bool((~self.teaching).any()) else self.teaching
+        return robust(trial.residual[judged] / sigma).sum((1, 2))
+
+    def noise(self, trial: Trial) -> Tensor:
+        """What a trial takes for noise, ``[n]``."""
+        return noise(trial.residual, self.windows.mask, len(trial.raw) + trial.starts.numel())
+
+    def cost(self, trial: Trial, best: Trial) -> float:
+        """Loss per measurement in units of the noise that ``best`` has."""
+        judged = ~self.teaching if bool((~self.teaching).any()) else self.teaching
+        total = self.losses(trial, self.noise(best)).sum() / self.windows.mask[judged].sum()
+        return float(total)
+
+    def better(self, trial: Trial, best: Trial) -> bool:
+        """Whether windows are better by three standard errors (or all), and by half a percent."""
+        sigma = self.noise(best)
+        gain = self.losses(best, sigma) - self.losses(trial, sigma)
+        error = gain.std() / len(gain) ** 0.5
+        whole = self.losses(best, sigma).sum()
+        clear = bool(gain.mean() > _CLEAR * error)
+        everywhere = bool((gain > 0).all()) and len(gain) >= 5  # few windows, but all of them
+        return (clear or everywhere) and bool(gain.sum() > _WORTH * whole)

@@ -1,0 +1,139 @@
+"""Real transitions of recordings, in the form in which a world's environment gives them."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.recordings.recording import Recording
+from phihp_torchrl.tasks import Task
+
+_log = logging.getLogger(__name__)
+
+_SLACK = 1e-4
+"""By how much of its range a command may be beyond a bound, as rounding in a log does."""
+
+
+def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
+    """Return the transitions of recordings, with the time step of each.
+
+    A transition is left out, and counted in the log, where a state is unknown before or after it,
+    and where its command is beyond the bounds of the task, which a model would clip.
+
+    Args:
+        task: the task, which says what was earned and where an episode ends.
+        recordings: recordings in the units of the task's system.
+
+    Returns:
+        ``"observation"`` ``[N, o]``, ``"action"`` ``[N, m]``, ``"time_step"`` ``[N, 1]`` in seconds
+        and, under ``"next"``, ``"observation"``, ``"reward"``, ``"terminated"`` and ``"done"``
+        ``[N, 1]``, float32, in order. ``"done"`` marks the last transition before an interruption.
+
+    Raises:
+        ConfigError: for recordings of another system, a state that was never measured, and if
+            nothing is left.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> time = torch.tensor([0.0, 0.05, 0.11])
+        >>> log = Recording(time, torch.zeros(3, 2), torch.ones(3, 1))
+        >>> data = transitions(get_task("pendulum"), [log])
+        >>> data["time_step"].flatten().tolist(), data["next", "done"].flatten().tolist()
+        ([0.05000000074505806, 0.05999999865889549], [False, True])
+    """
+    _check(task, recordings)
+    left: Counter[str] = Counter()
+    parts = [
+        part
+        for log, before in zip(recordings, (None, *recordings), strict=False)
+        if len(part := _of(task, log, _goes_on(log, before), left))
+    ]
+    for reason, count in left.items():
+        _log.warning("%d recorded transitions are left out: %s.", count, reason)
+    if not parts:
+        raise ConfigError("recordings", f"no transition can be used: {dict(left)}.")
+    return torch.cat(parts)
+
+
+def observations(task: Task, recording: Recording) -> Tensor:
+    """What the task observes at each sample, float64 ``[T, o]``.
+
+    This is the only place where a sample of a log becomes an observation: what a task adds to the
+    physical state, from the commands so far, belongs here.
+    """
+    if task.actuator is None:
+        return task.observe(recording.state)
+    held = torch.cat([recording.intervals, recording.intervals[-1:]])
+    _, registers = task.actuator.along(task.clip_action(recording.action), held)
+    return task.observe(torch.cat([recording.state, registers], -1))
+
+
+def _check(task: Task, recordings: Sequence[Recording]) -> None:
+    names, actions = task.system.state_names, task.system.action_names
+    for log in recordings:
+        if log.state.shape[-1] != len(names) or log.action.shape[-1] != len(actions):
+            raise ConfigError(
+                "recordings",
+                f"{log.source}: expected states {names} and commands {actions}, got "
+                f"{log.state.shape[-1]} and {log.action.shape[-1]} columns.",
+            )
+    measured = torch.stack([log.measured for log in recordings]).any(0) if recordings else ()
+    if missing := [n for n, known in zip(names, measured, strict=False) if not known]:
+        raise ConfigError(
+            "recordings",
+            f"expected a measured {missing[0]!r}, it is in no recording; name its column, or use "
+            "estimate_velocities for a velocity.",
+        )
+
+
+def _goes_on(log: Recording, before: Recording | None) -> bool:
+    """Whether a stretch starts in the middle of an episode."""
+    return (
+        before is not None and log.episode == before.episode and bool(log.time[0] > before.time[-1])
+    )
+
+
+def _of(task: Task, log: Recording, goes_on: bool, left: Counter[str]) -> TensorDict:
+    """The transitions of a stretch; one that goes on starts in the middle of an episode."""
+    observation, action = observations(task, log), log.action[:-1]
+    low = log.action.new_tensor(task.action_low or ())
+    high = log.action.new_tensor(task.action_high)
+    slack = _SLACK * (high - low)
+    outside = ((action < low - slack) | (action > high + slack)).any(-1)
+    known = observation.isfinite().all(-1)
+    unknown = ~(known[:-1] & known[1:])
+    left["a state is unknown before or after them"] += int(unknown.sum())
+    if goes_on and task.actuator is not None:
+        early = log.time[:-1] < log.time[0] + task.actuator.memory(task.time_step)
+        left["what was under way before their stretch is unknown"] += int((early & ~unknown).sum())
+        unknown |= early
+    left[
+        f"their commands are beyond the bounds of task {task.name!r}, {task.action_low} to "
+        f"{task.action_high}; widen those in Task(action_low=..., action_high=...)"
+    ] += int((outside & ~unknown).sum())
+    left -= Counter()  # drops the zeros
+    use = ~(unknown | outside)
+    at = use.nonzero()[:, 0]
+    state, following = log.state[:-1][use], log.state[1:][use]
+    done = torch.ones(len(at), 1, dtype=torch.bool)
+    done[:-1, 0] = at.diff() > 1
+    reward = task.reward(state.float(), action[use].float(), following.float())
+    return TensorDict(
+        observation=observation[:-1][use].float(),
+        action=task.clip_action(action[use].float()),
+        time_step=log.intervals[use].float()[:, None],
+        next=TensorDict(
+            observation=observation[1:][use].float(),
+            reward=reward[:, None],
+            done=done,
+            terminated=task.is_terminated(following.float())[:, None],
+            batch_size=[len(at)],
+        ),
+        batch_size=[len(at)],
+    )

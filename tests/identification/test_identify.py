@@ -1,0 +1,232 @@
+"""What recordings of simulated rigs say of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.identification import Identification, IdentifyConfig, identify
+from phihp_torchrl.integrators import make_integrator
+from phihp_torchrl.recordings import Recording
+from phihp_torchrl.tasks import Actuator
+from tests.identification.rigs import MASS, ROD, Mass, Rod, make_task, record
+
+UNSEEN = math.nan
+PLAIN: dict[str, Any] = {
+    "delay": 0.0,
+    "lag": 0.0,
+    "slew": 0.0,
+    "dead_zone": 0.0,
+    "gain_low": 1.0,
+    "integrator": "rk4",
+    "substeps": 1,
+}
+"""A perfect drive, so that a fit is all there is."""
+
+
+def inside(found: Identification, truth: dict[str, float]) -> dict[str, bool]:
+    every = {**found.constants, **found.combinations}
+    return {
+        name: every[name].low <= value <= every[name].high  # type: ignore[operator]
+        for name, value in truth.items()
+    }
+
+
+def codes(found: Identification) -> set[str]:
+    return {warning.code for warning in found.warnings}
+
+
+@pytest.fixture(scope="module")
+def swing() -> Identification:
+    log = record(Rod(), ROD, noise=(0.01, 0.05), samples=1000, hold=12, jitter=0.4)
+    return identify(make_task(Rod()), [log], IdentifyConfig(**PLAIN))
+
+
+def test_noise_does_not_bias_and_is_estimated(swing: Identification) -> None:
+    ratios = {
+        "gain / mass": ROD["gain"] / ROD["mass"],
+        "viscous / mass": ROD["viscous"] / ROD["mass"],
+    }
+    assert all(inside(swing, {"length": ROD["length"], **ratios}).values())
+    assert swing.noise["angle"] == pytest.approx(0.01, rel=0.1)
+    assert swing.noise["speed"] == pytest.approx(0.05, rel=0.1)
+    assert swing.errors["20"].floor_ratio < 2.0
+
+
+def test_constants_of_a_product_are_said_to_be_so(swing: Identification) -> None:
+    assert swing.constants["mass"].verdict == "only in combination with gain, viscous"
+    assert swing.constants["mass"].low is None
+    assert "No experiment" in swing.constants["mass"].advice
+    assert swing.constants["gravity"].verdict == "fixed"
+    assert swing.constants["length"].verdict == "identified"
+    assert "combination" in codes(swing)
+
+
+def test_an_irregular_clock_is_integrated_and_named(swing: Identification) -> None:
+    assert "clock" in codes(swing)
+
+
+def test_json_is_plain_and_has_its_keys(swing: Identification) -> None:
+    plain = json.loads(json.dumps(swing.to_json(), allow_nan=False))
+    assert {"constants", "actuator", "errors", "noise", "warnings"} <= set(plain)
+    assert set(plain["constants"]["length"]) >= {"guess", "estimate", "low", "high", "verdict"}
+    assert plain["actuator"]["delay_steps"] == 0.0
+    assert set(plain["errors"]) == {"1", "5", "20"}
+    assert all(isinstance(warning, str) for warning in plain["warnings"])
+    assert "length" in str(swing)
+
+
+def test_pictures_have_what_was_measured_beside_what_was_predicted(swing: Identification) -> None:
+    rollout = swing.rollouts[0]
+    lengths = {len(rollout.time), len(rollout.measured["angle"]), len(rollout.predicted["angle"])}
+    assert lengths == {rollout.begin + 20}
+    assert swing.residuals is not None
+    assert len(swing.residuals.time) == len(swing.residuals.previous["volts 1 before"])
+
+
+def test_the_task_takes_what_was_found(swing: Identification) -> None:
+    task = swing.task(make_task(Rod()))
+    assert task.system.constants["length"] == pytest.approx(ROD["length"], rel=0.02)
+    assert task.actuator is None
+
+
+def test_a_delay_that_is_not_modelled_is_named() -> None:
+    log = record(Mass(), MASS, actuator=Actuator(2.0), noise=(1e-3, UNSEEN), samples=1000)
+    found = identify(make_task(Mass()), [log], IdentifyConfig(**PLAIN))
+    assert {"delay", "error"} <= codes(found)
+
+
+def test_a_delay_is_found_with_positions_alone() -> None:
+    log = record(Mass(), MASS, actuator=Actuator(2.0), noise=(1e-3, UNSEEN), samples=800)
+    config = IdentifyConfig(**{**PLAIN, "delay": "auto"})
+    found = identify(make_task(Mass()), [log], config)
+    assert found.actuator.delay_steps == 2.0
+    assert all(inside(found, MASS).values())
+    task = found.task(make_task(Mass()))
+    assert task.actuator == Actuator(2.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "drive",
+    [
+        Actuator(1.4),
+        Actuator(1.0, lag=0.06),
+        Actuator(slew=30.0),
+        Actuator(dead_zone=0.6, gain_low=0.7),
+    ],
+)
+def test_the_path_of_the_command_is_found(drive: Actuator) -> None:
+    log = record(Mass(), MASS, actuator=drive, noise=(1e-3, UNSEEN), samples=2000)
+    found = identify(make_task(Mass()), [log])
+    actuator = found.actuator.actuator
+    assert actuator is not None
+    assert set(actuator.config) == set(drive.config)
+    for name, value in drive.config.items():
+        assert getattr(actuator, name) == pytest.approx(value, rel=0.05)
+    assert all(inside(found, MASS).values())
+
+
+def test_stops_are_found_left_out_and_given_to_the_task() -> None:
+    log = record(Mass(), MASS, stop=0.6, noise=(1e-3, UNSEEN), samples=1500)
+    found = identify(make_task(Mass()), [log], IdentifyConfig(**PLAIN))
+    assert "stops" in codes(found)
+    assert found.stops["x"] == pytest.approx((-0.6, 0.6), abs=0.005)
+    assert all(inside(found, MASS).values())
+    stop = next(region for region in found.regions if region.state == "stop")
+    assert stop.errors["x"].rmse < 0.05
+    assert found.task(make_task(Mass())).position_limits["x"] == found.stops["x"]
+
+
+def test_outliers_do_not_bias() -> None:
+    log = record(Mass(), MASS, noise=(1e-3, UNSEEN), samples=800)
+    state = log.state.clone()
+    state[::41, 0] += 0.3
+    spoiled = Recording(log.time, state, log.action)
+    found = identify(make_task(Mass()), [spoiled], IdentifyConfig(**PLAIN))
+    for name, value in MASS.items():
+        assert found.constants[name].estimate == pytest.approx(value, rel=0.02)
+    assert found.noise["x"] == pytest.approx(1e-3, rel=0.15)
+
+
+def test_gaps_and_missing_samples_are_counted_and_never_bridged() -> None:
+    log = record(Mass(), MASS, noise=(1e-3, UNSEEN), samples=900)
+    state = log.state.clone()
+    state[::7, 0] = math.nan
+    parts = [
+        Recording(log.time[a:b], state[a:b], log.action[a:b])
+        for a, b in ((0, 300), (305, 600), (601, 900))
+    ]
+    found = identify(make_task(Mass()), parts, IdentifyConfig(**PLAIN))
+    assert "gaps" in codes(found)
+    assert found.data["stretches"] == 3
+    assert found.data["missing"]["x"] == int(state[:, 0].isnan().sum()) - 1  # one lay in a gap
+    assert all(inside(found, MASS).values())
+
+
+def test_a_command_that_never_changes_tells_nothing_of_its_gain() -> None:
+    log = record(Mass(), MASS, noise=(1e-3, UNSEEN), samples=400, high=0.0)
+    found = identify(make_task(Mass()), [log], IdentifyConfig(**PLAIN))
+    assert found.constants["gain"].verdict == "not identified by these data"
+    assert "action" in found.constants["gain"].advice
+    assert {"unknown", "excitation"} <= codes(found)
+    assert all(inside(found, {"stiffness": 6.0, "damping": 0.5}).values())
+
+
+def test_a_velocity_in_other_units_is_named() -> None:
+    log = record(Mass(), MASS, noise=(1e-3, 1e-3), samples=400)
+    state = log.state * torch.tensor([1.0, 57.3])
+    found = identify(
+        make_task(Mass()), [Recording(log.time, state, log.action)], IdentifyConfig(**PLAIN)
+    )
+    assert "velocity" in codes(found)
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        ({"delay": -1.0}, "delay"),
+        ({"gain_low": 0.0}, "gain_low"),
+        ({"horizons": (0,)}, "horizons"),
+        ({"integrator": "dopri5"}, "integrator"),
+        ({"window": 3}, "window"),
+    ],
+)
+def test_settings_out_of_range_are_refused(settings: dict[str, Any], key: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        IdentifyConfig(**settings)
+    assert error.value.key == key
+
+
+def test_recordings_that_do_not_fit_are_refused() -> None:
+    task = make_task(Mass())
+    with pytest.raises(ConfigError, match="expected one or more"):
+        identify(task, [])
+    with pytest.raises(ConfigError, match="expected columns"):
+        identify(task, [Recording(torch.arange(9), torch.zeros(9, 3), torch.zeros(9, 1))])
+    nothing = Recording(torch.arange(9), torch.full((9, 2), math.nan), torch.zeros(9, 1))
+    with pytest.raises(ConfigError, match="NaN alone"):
+        identify(task, [nothing])
+    log = record(Mass(), MASS, samples=40)
+    with pytest.raises(ConfigError, match="unknown state"):
+        identify(task, [log], IdentifyConfig(stops={"y": (0.0, 1.0)}))
+
+
+def test_a_rig_that_was_simulated_by_eulers_steps_is_integrated_so() -> None:
+    state, states = torch.tensor([0.3, 0.0]).double(), []
+    command = (5.0 * torch.sin(torch.arange(400) ** 1.5 / 40.0)).double()[:, None]
+    truth, layout = Mass().with_constants(MASS), Mass().layout()
+    solver = make_integrator("semi_implicit_euler")
+    for u in command:
+        states.append(state)
+        state = solver(lambda s, u=u: truth.prior(s, u, truth.constants), state, 0.05, layout)
+    log = Recording(0.05 * torch.arange(400), torch.stack(states), command)
+    settings = {**PLAIN, "integrator": "auto", "substeps": 0}
+    found = identify(make_task(Mass(), step=0.05), [log], IdentifyConfig(**settings))
+    assert found.settings["integrator"] == "semi_implicit_euler"
+    assert found.constants["stiffness"].estimate == pytest.approx(MASS["stiffness"], rel=1e-3)

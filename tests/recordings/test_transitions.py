@@ -1,0 +1,99 @@
+"""Transitions of recordings, in the form of those of a world."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import pytest
+import torch
+
+from phihp_torchrl import Actuator, get_task
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.recordings import Recording, transitions
+
+PENDULUM = get_task("pendulum")
+
+
+def recording(count: int = 6, **changes: torch.Tensor) -> Recording:
+    parts = {
+        "time": 0.05 * torch.arange(count, dtype=torch.float64),
+        "state": torch.randn(count, 2),
+        "action": torch.rand(count, 1) - 0.5,
+    }
+    return Recording(**{**parts, **changes})
+
+
+def test_they_have_the_states_the_commands_and_the_time_steps_of_the_log() -> None:
+    time = torch.tensor([0.0, 0.05, 0.11, 0.13, 0.2, 0.3]).double()
+    log = recording(time=time)
+    data = transitions(PENDULUM, [log])
+    assert data.batch_size == (5,)
+    assert torch.equal(data["time_step"][:, 0], time.diff().float())
+    assert torch.equal(data["observation"], PENDULUM.observe(log.state)[:-1].float())
+    assert torch.equal(data["next", "observation"], PENDULUM.observe(log.state)[1:].float())
+    assert torch.equal(data["action"], log.action[:-1].float())
+    reward = PENDULUM.reward(log.state[:-1], log.action[:-1], log.state[1:])
+    assert torch.allclose(data["next", "reward"][:, 0], reward.float(), atol=1e-5)
+    assert data["next", "done"].flatten().tolist() == [False] * 4 + [True]
+    assert {v.dtype for v in data.values(True, True)} == {torch.float32, torch.bool}
+
+
+def test_a_state_that_is_unknown_ends_what_came_before(caplog: pytest.LogCaptureFixture) -> None:
+    state = torch.randn(6, 2)
+    state[3, 1] = torch.nan
+    with caplog.at_level(logging.WARNING):
+        data = transitions(PENDULUM, [recording(state=state), recording()])
+    assert data.batch_size == (3 + 5,)
+    assert data["next", "done"].flatten().nonzero().flatten().tolist() == [1, 2, 7]
+    assert "2 recorded transitions are left out: a state is unknown" in caplog.text
+
+
+def test_a_command_beyond_the_bounds_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    action = torch.tensor([[0.0], [2.0001], [3.0], [0.0], [0.0], [0.0]])
+    with caplog.at_level(logging.WARNING):
+        data = transitions(PENDULUM, [recording(action=action)])
+    assert data["action"].flatten().tolist() == [0.0, 2.0, 0.0, 0.0]
+    assert "1 recorded transitions are left out: their commands are beyond" in caplog.text
+    with pytest.raises(ConfigError, match="no transition can be used"):
+        transitions(PENDULUM, [recording(action=torch.full((6, 1), 9.0))])
+
+
+def test_the_task_says_where_an_episode_ends() -> None:
+    task = get_task("cartpole")
+    state = torch.zeros(4, 4)
+    state[2, 2] = 3.0
+    log = Recording(torch.arange(4), state, torch.zeros(4, 1))
+    data = transitions(task, [log])
+    following = task.locate(data["next", "observation"])
+    assert data["next", "terminated"][:, 0].tolist() == task.is_terminated(following).tolist()
+    assert data["next", "terminated"].any()
+
+
+def test_a_state_that_nobody_measured_is_refused() -> None:
+    state = torch.full((6, 2), torch.nan)
+    state[:, 0] = 0.0
+    with pytest.raises(ConfigError, match=r"expected a measured 'theta_dot'.*estimate_velocities"):
+        transitions(PENDULUM, [recording(state=state)])
+    with pytest.raises(ConfigError, match=r"expected states .* got 3 and 1 columns"):
+        transitions(PENDULUM, [recording(state=torch.zeros(6, 3))])
+    with pytest.raises(ConfigError, match="no transition"):
+        transitions(PENDULUM, [])
+
+
+def test_what_is_under_way_follows_the_commands_of_a_recording():
+    task = replace(get_task("pendulum"), actuator=Actuator(delay_steps=2.0))
+    commands = torch.tensor([[1.0], [-2.0], [0.5], [2.0]])
+    first = Recording(torch.arange(4) * 0.05, torch.zeros(4, 2), commands, source="a.csv")
+    data = transitions(task, [first])
+    waiting = data["observation"][:, task.system.observation_dim :]
+    assert waiting.tolist() == [[0.0, 0.0], [0.0, 0.5], [0.5, -1.0]]
+
+
+def test_a_stretch_that_goes_on_lacks_what_was_under_way():
+    task = replace(get_task("pendulum"), actuator=Actuator(delay_steps=2.0))
+    times = torch.arange(5) * task.time_step
+    first = Recording(times, torch.zeros(5, 2), torch.zeros(5, 1), source="a.csv")
+    second = replace(first, time=times + 10.0)
+    assert len(transitions(task, [first, second])) == 4 + 2
+    assert len(transitions(task, [first, replace(second, episode=1)])) == 4 + 4
