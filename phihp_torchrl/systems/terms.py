@@ -96,9 +96,68 @@ def stop(
     )
 
 
+def soft_stop(
+    acceleration: Value,
+    position: Value,
+    velocity: Value,
+    low: Value,
+    high: Value,
+    stiffness: Value,
+    damping: Value,
+    share: Value = 1.0,
+) -> Value:
+    r"""What soft stops at both ends of a range add to an acceleration, nothing between them.
+
+    Physics engines stop joints by a constraint and not by a spring: behind an end, with depth
+    :math:`d \ge 0`, velocity :math:`\dot d` and acceleration a into it, the stop replaces a share
+    s of the acceleration by a return to the end, and never pulls:
+
+    .. math:: \ddot d = a - \max(0,\; s\,(a + c\,\dot d + k\,d))
+
+    These are MuJoCo's limits of joints (Todorov, 2014; Baumgarte, 1972), with k and c from
+    ``solreflimit`` and s, close to 1, from ``solimplimit``. A stop that acts on other velocities
+    too adds its change times :meth:`System.impulse`:
+
+    .. code-block:: python
+
+        rate = super().prior(state, action, constants)
+        held = soft_stop(rate[..., 1], state[..., 0], state[..., 1], -1.8, 1.8, 150.0, 25.0)
+        rate = rate + held.unsqueeze(-1) * self.impulse("x", state, constants)
+
+    Args:
+        acceleration: acceleration without the stop, m/s² or rad/s², ``[*batch]``.
+        position: m or rad, ``[*batch]``.
+        velocity: m/s or rad/s, ``[*batch]``.
+        low: lower end of the range.
+        high: upper end of the range, above ``low``.
+        stiffness: k in 1/s², ``1 / (timeconst * dampratio)**2`` in MuJoCo's words.
+        damping: c in 1/s, ``2 / timeconst`` in MuJoCo's words.
+        share: s in (0, 1], the share of the acceleration that the stop holds.
+
+    Returns:
+        The change of the acceleration, ``[*batch]``.
+
+    Examples:
+        >>> push, position = torch.tensor([2.0, 2.0, 2.0]), torch.tensor([0.0, 1.5, -1.5])
+        >>> soft_stop(push, position, torch.zeros(3), -1.0, 1.0, stiffness=100.0, damping=20.0)
+        tensor([  0., -52.,  48.])
+    """
+    below, above = low - position, position - high
+    back_down = _positive(share * (acceleration + damping * velocity + stiffness * above))
+    back_up = _positive(share * (-acceleration - damping * velocity + stiffness * below))
+    return back_up * _step(below) - back_down * _step(above)
+
+
 def _positive(value: Value) -> Value:
     """The larger of ``value`` and 0."""
     return sympy.Max(value, 0) if _symbolic(value) else value.clamp_min(0.0)
+
+
+def _step(value: Value) -> Value:
+    """1 where ``value`` is positive, and 0 elsewhere."""
+    if _symbolic(value):
+        return sympy.Heaviside(value, 0)
+    return (value > 0).to(value.dtype)
 
 
 def _symbolic(value: Value) -> bool:

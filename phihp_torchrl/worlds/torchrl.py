@@ -208,8 +208,15 @@ def _check_action(task: Task, env: EnvBase) -> None:
 
 
 def frame(env: Any) -> NDArray[Any] | None:
-    """Return the picture that a wrapped gymnasium environment renders, or ``None``."""
+    """Return the picture that a wrapped gymnasium environment renders, or ``None``.
+
+    Raises:
+        ConfigError: if the environment cannot render, as where a library for it is not installed.
+    """
     base = getattr(env, "base_env", env)
     inner = getattr(base, "_env", None)
-    picture = inner.render() if inner is not None and hasattr(inner, "render") else None
+    try:
+        picture = inner.render() if inner is not None and hasattr(inner, "render") else None
+    except Exception as error:  # somebody else's renderer may raise anything
+        raise ConfigError("render", f"{type(error).__name__}: {error}") from error
     return picture if getattr(picture, "ndim", 0) == 3 else None

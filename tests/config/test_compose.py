@@ -293,7 +293,10 @@ def composed() -> Any:
         ("preset=nonsense", "preset: expected one of ['default', 'paper'], got 'nonsense'."),
         ("method=nonsense", "method: expected one of ['cem-oracle', "),
         ("logger=nonsense", "logger: expected one of ['csv', 'tensorboard', 'wandb'], got"),
-        ("world=nonsense", "world: expected one of ['given', 'gymnasium', 'simulated', "),
+        (
+            "world=nonsense",
+            "world: expected one of ['given', 'gymnasium', 'recorded', 'simulated', ",
+        ),
         ("planner=nonsense", "planner: expected one of ['cem', 'mppi'], got 'nonsense'."),
         ("budget=nonsense", "budget: expected one of ['fast', 'full'], got 'nonsense'."),
         ("seed=[1", "settings: "),

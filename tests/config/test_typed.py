@@ -124,6 +124,7 @@ def settings_classes() -> list[type]:
 
 NEEDED = {
     "GymnasiumConfig": {"id": "Pendulum-v1"},
+    "RecordedConfig": {"files": "logs/*.csv"},
     "TorchRLConfig": {"make": "module:function"},
     "RunConfig": {"task": "pendulum"},
     "ExportConfig": {"agent": "somewhere"},
@@ -207,6 +208,7 @@ ANY_SETTINGS = st.one_of(
         steps_per_iteration=st.none() | counts,
         hidden_sizes=sizes,
         activation=st.sampled_from(["relu", "tanh", "silu"]),
+        integrator=st.sampled_from(["semi_implicit_euler", "rk4"]),
         substeps=counts,
         warm_start=st.booleans(),
         fit=st.builds(

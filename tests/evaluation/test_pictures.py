@@ -6,12 +6,14 @@ import logging
 import math
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 from lopsided import LOPSIDED
 from PIL import Image
 
-from phihp_torchrl import get_task
+from phihp_torchrl import Agent, get_task
+from phihp_torchrl.agents import Actor
 from phihp_torchrl.evaluation import (
     episode_figure,
     evaluation_seed,
@@ -19,7 +21,13 @@ from phihp_torchrl.evaluation import (
     show_episode,
     write_gif,
 )
-from phihp_torchrl.worlds import EnvWorld, SimulatedConfig, SimulatedWorld
+from phihp_torchrl.worlds import (
+    EnvWorld,
+    GymnasiumConfig,
+    GymnasiumWorld,
+    SimulatedConfig,
+    SimulatedWorld,
+)
 
 from .policies import constant, planner
 
@@ -122,3 +130,18 @@ def test_where_nothing_is_drawn_a_figure_is_left_and_a_warning(tmp_path, caplog)
     assert [file.name for file in files] == ["episode.png"]
     assert [path.name for path in tmp_path.iterdir()] == ["episode.png"]
     assert "No GIF of the episode: render: expected a world that draws" in caplog.text
+
+
+def test_a_world_that_cannot_draw_is_told_and_ends_nothing(tmp_path, caplog, monkeypatch):
+    task = replace(get_task("pendulum"), max_steps=3)
+    world = GymnasiumWorld(task, GymnasiumConfig("Pendulum-v1"))
+    drawn = "gymnasium.envs.classic_control.pendulum.PendulumEnv.render"
+    missing = gymnasium.error.DependencyNotInstalled("pygame is not installed")
+
+    def render(self):
+        raise missing
+
+    monkeypatch.setattr(drawn, render)
+    files = show_episode(Agent(task, actor=Actor(task)), tmp_path, world=world)
+    assert [file.name for file in files] == ["episode.png"]
+    assert "pygame is not installed" in caplog.text

@@ -48,6 +48,33 @@ def test_a_stop_pushes_back_and_never_pulls(position, speed, stiffness, damping)
         assert abs(force.item()) == pytest.approx(max(0.0, depth * (stiffness + damping * inward)))
 
 
+@given(st.floats(-3, 3), speeds, speeds, sizes, sizes, st.floats(0.1, 1.0))
+def test_a_soft_stop_holds_and_never_pulls(position, speed, push, stiffness, damping, share):
+    a, x, v = torch.tensor([push, position, speed], dtype=torch.float64)
+    change = terms.soft_stop(a, x, v, -1.0, 2.0, stiffness, damping, share).item()
+    mirrored = terms.soft_stop(-a, -x, -v, -2.0, 1.0, stiffness, damping, share).item()
+    assert mirrored == pytest.approx(-change)
+    if -1.0 <= position <= 2.0:
+        assert change == 0
+        return
+    side = -1.0 if position < -1.0 else 1.0
+    depth = -1.0 - position if position < -1.0 else position - 2.0
+    assert side * change <= 0
+    if change != 0:  # what is left of the push, and the way back
+        back = damping * side * speed + stiffness * depth
+        expected = (1 - share) * side * push - share * back
+        assert side * (push + change) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_soft_stop_carries_a_push_at_a_small_depth():
+    x, v, push = torch.tensor([0.99, 1.0, 5.0], dtype=torch.float64)
+    for _ in range(5000):
+        v = v + 1e-3 * (push + terms.soft_stop(push, x, v, -1.0, 1.0, 100.0, 20.0, 0.9))
+        x = x + 1e-3 * v
+    assert v.abs() < 1e-6
+    assert x.item() == pytest.approx(1.0 + 0.1 * 5.0 / (0.9 * 100.0), abs=1e-6)
+
+
 @pytest.mark.parametrize(("damping", "kept"), [(0.0, 1.0), (100.0, None)])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_a_bounce_keeps_the_energy_without_damping_and_loses_some_with_it(damping, kept, side):
@@ -73,6 +100,8 @@ def test_terms_of_symbols_are_those_of_tensors():
         lambda x, v, c: terms.coulomb(v, 0.2, c),
         lambda x, v, c: terms.stop(x, v, -1, c, 30, 4),
         lambda x, v, c: terms.stop(-x, v, -1, 1, 30 * c, c),
+        lambda x, v, c: terms.soft_stop(3 * c, x, v, -1, 1, 30, 4, c),
+        lambda x, v, c: terms.soft_stop(-c, -x, v, -c, 1, 30 * c, c),
     ):
         expected = term(*numbers.values()).item()
         assert float(term(x, v, c).subs(at)) == pytest.approx(expected)
