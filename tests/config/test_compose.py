@@ -293,7 +293,7 @@ def composed() -> Any:
         ("preset=nonsense", "preset: expected one of ['default', 'paper'], got 'nonsense'."),
         ("method=nonsense", "method: expected one of ['cem-oracle', "),
         ("logger=nonsense", "logger: expected one of ['csv', 'tensorboard', 'wandb'], got"),
-        (
+        ("world=nonsense", "world: expected one of ['given', 'gymnasium', 'recorded', "),
             "world=nonsense",
             "world: expected one of ['given', 'gymnasium', 'recorded', 'simulated', ",
         ),
