@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from phihp_torchrl.dynamics.covariance import constants_covariance, draw_shifts
 from phihp_torchrl.dynamics.ensemble import EnsembleResidual
-from phihp_torchrl.dynamics.fitting import FitConfig, FitReport, fit
+from phihp_torchrl.dynamics.fit_config import FitConfig
+from phihp_torchrl.dynamics.fitting import FitReport, fit
 from phihp_torchrl.dynamics.held_out import (
     BLOCK,
     rollout_error,

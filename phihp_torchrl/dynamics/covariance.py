@@ -9,7 +9,7 @@ from torch.func import jacrev, vmap
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.dynamics.ensemble import EnsembleResidual
-from phihp_torchrl.dynamics.fitting import _LeastSquares
+from phihp_torchrl.dynamics.least_squares import LeastSquares
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.dynamics.members import member_loss
 from phihp_torchrl.dynamics.prior import PhysicsPrior
@@ -86,15 +86,15 @@ def constants_covariance(
         )
     if isinstance(loss.dynamics.residual, EnsembleResidual):
         loss = member_loss(loss, 0)
-    system = _LeastSquares(loss)
-    theta = system.parameters().double()
+    system = LeastSquares(loss)
+    theta = system.vector.read().double()
     chosen = train[torch.arange(len(train))[:: -(-len(train) // rows)]]
     share = len(chosen) / len(train)
     transitions = [part.double() for part in loss.transitions(chosen)]
     penalised = transitions[1].roll(len(chosen) // 2, 0)  # as the fit's: actions of other rows
     clock = loss.time_step(chosen)
     measured = (*transitions, penalised, *(() if clock is None else (clock.double(),)))
-    differentiate = vmap(jacrev(system._row), (None, *[0] * len(measured)))
+    differentiate = vmap(jacrev(system.row), (None, *[0] * len(measured)))
     parts = zip(*(x.split(200) for x in measured), strict=True)
     jacobian = torch.cat([differentiate(theta, *part) for part in parts])
     size = loss.dynamics.task.system.state_dim
@@ -106,9 +106,9 @@ def constants_covariance(
     ridge = omega.diagonal().mean().clamp_min(_ROUNDING) / _GUESS_STD**2
     identity = torch.eye(len(theta)).to(theta)
     bread = every.mT @ every / share + ridge * identity
-    first = list(system.named).index(_CONSTANTS)
-    start = sum(system.sizes[:first])
-    columns = torch.linalg.solve(bread, identity[:, start : start + system.sizes[first]])
+    first = list(system.vector.named).index(_CONSTANTS)
+    start = sum(system.vector.sizes[:first])
+    columns = torch.linalg.solve(bread, identity[:, start : start + system.vector.sizes[first]])
     swayed = weighted @ columns
     return (swayed.mT @ swayed / share).float()
 

@@ -4,91 +4,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
-from torch.func import functional_call, jacrev, vmap
 
-from phihp_torchrl.config import ConfigError, check_choice, check_count, check_positive
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.dynamics.ensemble import EnsembleResidual
+from phihp_torchrl.dynamics.fit_config import FitConfig
+from phihp_torchrl.dynamics.least_squares import levenberg_marquardt
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.dynamics.members import member_loss
 from phihp_torchrl.dynamics.residual import ResidualMLP
-from phihp_torchrl.dynamics.robust import huber_loss, huber_weight, robust_spread
 from phihp_torchrl.dynamics.shooting import multiple_shooting
-
-
-@dataclass(frozen=True)
-class FitConfig:
-    """How a model is fitted to transitions.
-
-    Args:
-        method: ``"levenberg_marquardt"``, ``"multiple_shooting"`` or ``"adam"``. The model is small
-            and its loss is a sum of squares, so a second-order method reaches within seconds errors
-            that Adam never reaches. Multiple shooting is for noisy sensors: it fits trajectories
-            whose starts are free.
-        steps: number of optimization steps.
-        scaled: whether errors are measured in units of one-step changes
-            (:meth:`DynamicsLoss.set_scales`), or in raw units as published.
-        batch_size: transitions per step; ``None`` for all of them, as published.
-        learning_rate: learning rate of Adam.
-        cosine_decay: whether the learning rate of Adam decays to zero.
-        initial_lambda: first value of λ for methods of least squares. A small one lets the prior
-            explain as much as it can before the residual contributes.
-        final_lambda: last value of λ for them.
-        patience: they stop after this many steps at the final λ in which the held-out error did not
-            fall by a tenth (multiple shooting: by a hundredth).
-        window: steps in a trajectory of multiple shooting.
-        shuffle_actions: whether the penalty on F^r of Levenberg-Marquardt pairs each state with the
-            action of another transition. The actions of a controller go with the velocities, so
-            that the smallest F^r on the pairs as recorded would explain friction by a wrong effect
-            of the action.
-        robust: errors of Levenberg-Marquardt beyond so many robust standard deviations count in
-            proportion to their size and no longer to its square, so that outliers and hits of
-            stops, which the equations do not describe, do not dominate the fit; 1.5 to 3 is usual.
-            Null for squares.
-
-    Raises:
-        ConfigError: for a value out of range; the message names the field.
-
-    Examples:
-        >>> FitConfig(method="newton")
-        Traceback (most recent call last):
-        ...
-        phihp_torchrl.config.ConfigError: method: expected one of ['levenberg_marquardt', \
-'multiple_shooting', 'adam'], got 'newton'.
-    """
-
-    method: str = "levenberg_marquardt"
-    steps: int = 60
-    scaled: bool = True
-    batch_size: int | None = 1000
-    learning_rate: float = 1e-3
-    cosine_decay: bool = False
-    initial_lambda: float = 1e-2
-    final_lambda: float = 1e7
-    patience: int = 8
-    window: int = 20
-    shuffle_actions: bool = True
-    robust: float | None = None
-
-    def __post_init__(self) -> None:
-        check_choice(self, "method", _METHODS)
-        check_count(self, "steps", "patience", "window")
-        check_positive(self, "learning_rate", "initial_lambda", "final_lambda")
-        if self.batch_size is not None:
-            check_count(self, "batch_size")
-        if self.robust is not None:
-            check_positive(self, "robust")
-            if self.method != "levenberg_marquardt":
-                raise ConfigError(
-                    "robust",
-                    f"expected null with method={self.method!r}, which has a loss of its own, "
-                    f"got {self.robust}.",
-                )
 
 
 @dataclass(frozen=True)
@@ -187,7 +115,7 @@ def _fit_members(
     config: FitConfig,
     generator: torch.Generator | None,
 ) -> int:
-    method = _adam if config.method == "adam" else _levenberg_marquardt
+    method = _METHODS[config.method]
     steps, count = 0, len(train)
     for index in range(ensemble.members):
         own = member_loss(loss, index)
@@ -231,161 +159,8 @@ def _adam(
     return config.steps
 
 
-@torch.no_grad()
-def _levenberg_marquardt(
-    loss: DynamicsLoss,
-    train: TensorDictBase,
-    held_out: TensorDictBase,
-    config: FitConfig,
-    generator: torch.Generator | None,
-) -> int:
-    r"""Minimise mean ‖error‖² + (1/lambda) mean ‖F^r‖² by damped Gauss-Newton steps.
-
-    .. math:: (J^\top J + \mu\,\mathrm{diag}\,J^\top J)\,\delta = -J^\top r
-
-    The penalty is a square, unlike the norm in the paper's equation 3, because the method needs
-    squares; and F^r is penalised at shuffled actions if ``config.shuffle_actions`` is set.
-    """
-    system = _LeastSquares(loss, config.robust)
-    transitions = loss.transitions(train)
-    penalised_action = transitions[1]
-    if config.shuffle_actions:
-        order = torch.randperm(len(penalised_action), generator=generator)
-        penalised_action = penalised_action[order]
-    reference, seconds = _timed(loss, held_out), loss.time_step(train)
-    theta = system.parameters()
-    damping = 1e-2
-    growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
-    loss.lambda_.fill_(config.initial_lambda)
-    # The first parameters are a candidate too, because they may come from an earlier, better fit.
-    best, best_error = theta, system.prediction_error(theta, reference)
-    if not math.isfinite(best_error):
-        best_error = math.inf
-    stale, steps = 0, 0
-    while steps < config.steps:
-        steps += 1
-        rows: tuple[Tensor, ...] = (*transitions, penalised_action)
-        rows += () if seconds is None else (seconds,)
-        if config.batch_size is not None and config.batch_size < len(train):
-            index = torch.randint(len(train), (config.batch_size,), generator=generator)
-            rows = tuple(part[index] for part in rows)
-        theta, damping, improved = system.step(theta, rows, damping)
-        error = system.prediction_error(theta, reference)
-        stale = 0 if error < 0.9 * best_error else stale + 1
-        if error < best_error:
-            best, best_error = theta, error
-        final = loss.lambda_.item() >= config.final_lambda
-        if final and (stale >= config.patience or not improved):
-            break
-        loss.lambda_.mul_(growth).clamp_(max=config.final_lambda)
-    system.write(best)
-    return steps
-
-
-def _timed(loss: DynamicsLoss, data: TensorDictBase) -> tuple[Tensor, ...]:
-    """The arguments of :meth:`DynamicsLoss.terms`, with time steps where the data have them."""
-    transition, seconds = loss.transitions(data), loss.time_step(data)
-    return transition if seconds is None else (*transition, transition[1], seconds)
-
-
 _METHODS = {
-    "levenberg_marquardt": _levenberg_marquardt,
+    "levenberg_marquardt": levenberg_marquardt,
     "multiple_shooting": multiple_shooting,
     "adam": _adam,
 }
-
-
-class _LeastSquares:
-    """The residuals of the least-squares problem, and their Jacobian, by one parameter vector."""
-
-    def __init__(self, loss: DynamicsLoss, robust: float | None = None) -> None:
-        self.loss, self.robust = loss, robust
-        self.named = dict(loss.named_parameters())
-        self.sizes = [p.numel() for p in self.named.values()]
-
-    def parameters(self) -> Tensor:
-        return torch.cat([p.detach().reshape(-1) for p in self.named.values()])
-
-    def write(self, theta: Tensor) -> None:
-        for name, value in self._unpack(theta).items():
-            self.named[name].copy_(value)
-
-    def _unpack(self, theta: Tensor) -> dict[str, Tensor]:
-        parts = zip(self.named.items(), theta.split(self.sizes), strict=True)
-        return {name: part.reshape(p.shape) for (name, p), part in parts}
-
-    def _terms(self, theta: Tensor, *transition: Tensor) -> tuple[Tensor, Tensor]:
-        parameters = {f"loss.{name}": value for name, value in self._unpack(theta).items()}
-        return functional_call(_Terms(self.loss), parameters, transition)
-
-    def _error(self, theta: Tensor, *transition: Tensor) -> Tensor:
-        return self._terms(theta, *transition)[0]
-
-    def _row(self, theta: Tensor, *transition: Tensor) -> Tensor:
-        error, residual = self._terms(theta, *transition)
-        return torch.cat([error, residual / self.loss.lambda_.sqrt()])
-
-    def prediction_error(self, theta: Tensor, transitions: tuple[Tensor, ...]) -> float:
-        errors = _each(self._error)(theta, *transitions)
-        if self.robust is not None:
-            bend = self.robust * robust_spread(errors)
-            return huber_loss(errors, bend).sum(-1).mean().item()
-        return errors.square().sum(-1).mean().item()
-
-    def _rows(self, theta: Tensor, *rows: Tensor) -> Tensor:
-        return _each(self._row)(theta, *rows)
-
-    def step(
-        self, theta: Tensor, rows: tuple[Tensor, ...], damping: float
-    ) -> tuple[Tensor, float, bool]:
-        """Take one damped step: new parameters, new damping, and whether the cost has fallen."""
-        values = self._rows(theta, *rows)
-        jacobian = _each(jacrev(self._row))(theta, *rows).reshape(values.numel(), -1)
-        bend = self._bend(values)
-        cost = self._cost(values, bend)
-        if bend is not None:
-            weight = huber_weight(values, bend).sqrt()
-            values, jacobian = weight * values, weight.reshape(-1, 1) * jacobian
-        values = values.reshape(-1)
-        normal = (jacobian.mT @ jacobian).double()
-        gradient = (jacobian.mT @ values).double()
-        diagonal = normal.diagonal().clamp_min(1e-9 * normal.diagonal().max())
-        for _ in range(8):
-            delta, info = torch.linalg.solve_ex(normal + damping * diagonal.diag(), gradient)
-            candidate = theta - delta.to(theta.dtype)
-            if info == 0 and self._cost(self._rows(candidate, *rows), bend) < cost:
-                return candidate, max(damping / 5.0, 1e-10), True
-            damping = min(damping * 4.0, 1e8)
-        return theta, damping, False
-
-    def _bend(self, values: Tensor) -> Tensor | None:
-        """Where squares end, for errors and penalties ``[N, 2n]``; penalties stay squares."""
-        if self.robust is None:
-            return None
-        errors, penalties = values.chunk(2, -1)
-        bend = self.robust * robust_spread(errors)
-        return torch.cat([bend, torch.full_like(penalties[0], math.inf)])
-
-    @staticmethod
-    def _cost(values: Tensor, bend: Tensor | None) -> Tensor:
-        return (values.square() if bend is None else huber_loss(values, bend)).reshape(-1).sum()
-
-
-def _each(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Map a function of parameters and one transition over all transitions."""
-
-    def mapped(theta: Tensor, *rows: Tensor) -> Tensor:
-        return vmap(function, (None, *[0] * len(rows)))(theta, *rows)
-
-    return mapped
-
-
-class _Terms(torch.nn.Module):
-    """:meth:`DynamicsLoss.terms` as a forward pass."""
-
-    def __init__(self, loss: DynamicsLoss) -> None:
-        super().__init__()
-        self.loss = loss
-
-    def forward(self, *transition: Tensor) -> tuple[Tensor, Tensor]:
-        return self.loss.terms(*transition)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torch.func import functional_call, jacrev, vmap
 
+from phihp_torchrl.dynamics.fit_config import FitConfig
 from phihp_torchrl.dynamics.loss import DynamicsLoss
-
-if TYPE_CHECKING:
-    from phihp_torchrl.dynamics.fitting import FitConfig
+from phihp_torchrl.dynamics.parameters import ParameterVector
 
 _HUGE = 1e6
 """Size of an error, in steps, at which a window has diverged."""
@@ -95,7 +93,7 @@ def multiple_shooting(
     problem = _Shooting(loss)
     windows = cut_windows(loss, train, config.window)
     reference = cut_windows(loss, held_out, config.window)
-    theta = problem.parameters()
+    theta = problem.vector.read()
     starts, checks = windows.states[:, 0].clone(), reference.states[:, 0].clone()
     growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
     loss.lambda_.fill_(config.initial_lambda)
@@ -125,7 +123,7 @@ def multiple_shooting(
         if final and (stale >= config.patience or not improved):
             break
         loss.lambda_.mul_(growth).clamp_(max=config.final_lambda)
-    problem.write(best)
+    problem.vector.write(best)
     return steps
 
 
@@ -135,27 +133,15 @@ class _Shooting:
     def __init__(self, loss: DynamicsLoss) -> None:
         self.loss = loss
         self._model = _Step(loss)
-        self.named = dict(loss.dynamics.named_parameters())
-        self.sizes = [p.numel() for p in self.named.values()]
+        self.vector = ParameterVector(loss.dynamics)
         rows = (None, 0, 0, 0)
         self._steps = vmap(self._step, rows)
         self._slopes = vmap(jacrev(self._step, (0, 1)), rows)
         self._residuals = vmap(self._residual, (None, 0, 0))
         self._residual_slopes = vmap(jacrev(self._residual), (None, 0, 0))
 
-    def parameters(self) -> Tensor:
-        return torch.cat([p.detach().reshape(-1) for p in self.named.values()])
-
-    def write(self, theta: Tensor) -> None:
-        for name, value in self._unpack(theta).items():
-            self.named[name].copy_(value)
-
-    def _unpack(self, theta: Tensor) -> dict[str, Tensor]:
-        parts = zip(self.named.items(), theta.split(self.sizes), strict=True)
-        return {name: part.reshape(p.shape) for (name, p), part in parts}
-
     def _step(self, theta: Tensor, state: Tensor, action: Tensor, seconds: Tensor) -> Tensor:
-        named = {f"dynamics.{name}": value for name, value in self._unpack(theta).items()}
+        named = self.vector.unpack(theta, "dynamics.")
         return functional_call(self._model, named, (state, action, seconds))
 
     def _residual(self, theta: Tensor, state: Tensor, action: Tensor) -> Tensor:
@@ -165,7 +151,7 @@ class _Shooting:
         start = "residual."
         parts = {
             name.removeprefix(start): value
-            for name, value in self._unpack(theta).items()
+            for name, value in self.vector.unpack(theta).items()
             if name.startswith(start)
         }
         return functional_call(dynamics.residual, parts, (state, action)) / self.loss.residual_scale

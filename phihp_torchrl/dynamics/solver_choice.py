@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from tensordict import TensorDictBase
 
-from phihp_torchrl.dynamics.fitting import FitConfig, FitReport, fit
+from phihp_torchrl.dynamics.fit_config import FitConfig
+from phihp_torchrl.dynamics.fitting import FitReport, fit
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.integrators import RK4, Integrator, SemiImplicitEuler
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from phihp_torchrl.recordings.columns import Column
 from phihp_torchrl.recordings.reading import RecordedData, read_recordings
-from phihp_torchrl.recordings.recording import Recording
+from phihp_torchrl.recordings.recording import Recording, check_columns
 from phihp_torchrl.recordings.transitions import transitions
 from phihp_torchrl.recordings.velocities import estimate_velocities
 

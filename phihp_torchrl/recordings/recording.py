@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.systems import System
 
 
 @dataclass(frozen=True)
@@ -79,3 +81,20 @@ class Recording:
     def measured(self) -> Tensor:
         """Which components of the state were ever measured, bool ``[n]``."""
         return self.state.isfinite().any(0)
+
+
+def check_columns(system: System, recordings: Sequence[Recording], key: str = "recordings") -> None:
+    """Refuse recordings that do not have the states and actions of a system.
+
+    Raises:
+        ConfigError: with ``key`` as its key; the message names the recording.
+    """
+    states, actions = system.state_names, system.action_names
+    for log in recordings:
+        found = log.state.shape[-1], log.action.shape[-1]
+        if found != (len(states), len(actions)):
+            raise ConfigError(
+                key,
+                f"{log.source}: expected states {states} and commands {actions}, got "
+                f"{found[0]} and {found[1]} columns.",
+            )

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.recordings.recording import Recording
+from phihp_torchrl.recordings.recording import Recording, check_columns
 from phihp_torchrl.tasks import Task
 
 _log = logging.getLogger(__name__)
@@ -75,14 +75,8 @@ def observations(task: Task, recording: Recording) -> Tensor:
 
 
 def _check(task: Task, recordings: Sequence[Recording]) -> None:
-    names, actions = task.system.state_names, task.system.action_names
-    for log in recordings:
-        if log.state.shape[-1] != len(names) or log.action.shape[-1] != len(actions):
-            raise ConfigError(
-                "recordings",
-                f"{log.source}: expected states {names} and commands {actions}, got "
-                f"{log.state.shape[-1]} and {log.action.shape[-1]} columns.",
-            )
+    names = task.system.state_names
+    check_columns(task.system, recordings)
     measured = torch.stack([log.measured for log in recordings]).any(0) if recordings else ()
     if missing := [n for n, known in zip(names, measured, strict=False) if not known]:
         raise ConfigError(

@@ -12,6 +12,7 @@ from phihp_torchrl.config import ConfigError
 from phihp_torchrl.recordings import (
     RecordedData,
     Recording,
+    check_columns,
     estimate_velocities,
     read_recordings,
 )
@@ -103,14 +104,7 @@ class RecordedWorld(World):
         logs = list(given)
         if not logs:
             raise ConfigError("world", "expected at least one recording, got none.")
-        states, actions = task.system.state_names, task.system.action_names
-        for log in logs:
-            if log.state.shape[-1] != len(states) or log.action.shape[-1] != len(actions):
-                raise ConfigError(
-                    "world",
-                    f"{log.source}: expected states {states} and commands {actions}, got "
-                    f"{log.state.shape[-1]} and {log.action.shape[-1]} columns.",
-                )
+        check_columns(task.system, logs, "world")
         self.config: RecordedConfig | None = None
         self.label = label
         self.measured = logs

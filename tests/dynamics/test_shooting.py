@@ -46,7 +46,7 @@ def test_derivatives_are_those_by_differences():
     loss = DynamicsLoss(HybridDynamics.hybrid(TASK, hidden_sizes=(3,))).double()
     problem = _Shooting(loss)
     windows = cut_windows(loss, episodes(count=1, steps=6).double(), 6)
-    theta, starts = problem.parameters(), windows.states[:, 0]
+    theta, starts = problem.vector.read(), windows.states[:, 0]
     paths = problem.paths(theta, starts, windows)
     along, through = problem._through(theta, paths, windows, parameters=True)
     step = 1e-6
