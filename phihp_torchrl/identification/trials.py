@@ -96,7 +96,9 @@ class Trials:
         sigma = self.noise(best)
         before = self.losses(best, sigma)
         gain = before - self.losses(trial, sigma)
-        mean = float(gain.mean() / gain.std() * len(gain) ** 0.5)  # the ranks of few cannot be clear
+        mean = float(
+            gain.mean() / gain.std() * len(gain) ** 0.5
+        )  # the ranks of few cannot be clear
         clear = max(signed_rank(gain), mean) >= _CLEAR
         everywhere = bool((gain > 0).all()) and len(gain) >= 5
         return (clear or everywhere) and bool(gain.sum() > _WORTH * before.sum())
