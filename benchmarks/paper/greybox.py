@@ -191,7 +191,7 @@ def one_step(rates: Equations, log: Log, guess: Array) -> Found:
     """Predict each sample from the one before, velocities taken by differences."""
     before, after = log.guess[:, :-1], log.guess[:, 1:]
     measured = np.isfinite(log.state).any((0, 1))
-    seen = np.asarray(np.isfinite(log.state) | ~measured).all(-1)
+    seen = np.logical_and.reduce(np.isfinite(log.state) | ~measured, axis=-1)
     good = seen[:, :-1] & seen[:, 1:] & (log.seconds[:, :-1] > 0)
     action, seconds = log.action[:, :-1][good], log.seconds[:, :-1][good]
     state, target = list(before[good].T), after[good].T

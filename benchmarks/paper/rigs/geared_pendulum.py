@@ -1,5 +1,8 @@
 """A rod on a geared motor, of which a log has the angle and the voltage."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -23,7 +26,7 @@ class GearedPendulum(System):
         "coulomb": 0.01,
     }
 
-    def prior(self, state: Tensor, action: Tensor, constants: dict) -> Tensor:
+    def prior(self, state: Tensor, action: Tensor, constants: Mapping[str, Any]) -> Tensor:
         mass, length, gain, viscous, coulomb = constants.values()
         angle, speed = state.unbind(-1)
         friction = viscous * speed + coulomb * torch.tanh(speed / 0.02)
@@ -31,7 +34,7 @@ class GearedPendulum(System):
         torque = gain * action[..., 0] - pull - friction
         return torch.stack([speed, torque / (mass * length**2 / 3.0)], -1)
 
-    def identifiable(self, constants: dict) -> dict:
+    def identifiable(self, constants: Mapping[str, Any]) -> dict[str, Any]:
         """What motion can tell: everything over the moment of inertia."""
         mass, length, gain, viscous, coulomb = constants.values()
         inertia = mass * length**2 / 3.0

@@ -1,5 +1,8 @@
 """A cart with a pole on a short rail, of which a log has both positions and the force."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -23,7 +26,7 @@ class ShortRail(System):
         "pole_viscous": 0.001,
     }
 
-    def prior(self, state: Tensor, action: Tensor, constants: dict) -> Tensor:
+    def prior(self, state: Tensor, action: Tensor, constants: Mapping[str, Any]) -> Tensor:
         cart, pole, half, coulomb, viscous = constants.values()
         _, speed, theta, turning = state.unbind(-1)
         sin, cos = theta.sin(), -theta.cos()  # of the angle from upright, pi - theta

@@ -1,5 +1,8 @@
 """Two tanks in a row, of which a log has both levels and the share of the pump."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -21,7 +24,7 @@ class TwoTanks(System):
         "flow": 1e-4,
     }
 
-    def prior(self, state: Tensor, action: Tensor, constants: dict) -> Tensor:
+    def prior(self, state: Tensor, action: Tensor, constants: Mapping[str, Any]) -> Tensor:
         area_1, area_2, outlet_1, outlet_2, flow = constants.values()
         first, second = (2.0 * GRAVITY * state.clamp_min(1e-6)).sqrt().unbind(-1)
         between, out = outlet_1 * first, outlet_2 * second
