@@ -8,6 +8,7 @@ cart with a pole on a short rail (positions alone, hard stops that it hits often
 from __future__ import annotations
 
 import csv
+import json
 import math
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import Box, Task
 
 CASES = Path(__file__).parents[1] / "cases"
+TRUTH = json.loads((CASES / "truth.json").read_text())
 G = 9.81
 
 
@@ -133,17 +135,11 @@ def test_the_pendulum() -> None:
     state = torch.stack([angle, torch.full_like(angle, math.nan)], -1)
     log = Recording(time, state, volts[:, None], "pendulum.csv")
     found = identify(make_task(Pendulum(), -6.0, 12.0, 0.02), [log])
-    inertia = 0.24 * 0.36**2 / 3.0
-    check(
-        found,
-        {
-            "gain/inertia": 0.03 / inertia,
-            "1.5 g/l": 1.5 * G / 0.36,
-            "viscous/inertia": 0.016 / inertia,
-            "coulomb/inertia": 0.02 / inertia,
-        },
-    )
-    assert found.actuator.delay_steps == 2.0
+    truth = TRUTH["pendulum"]
+    inertia = truth["mass"] * truth["length"] ** 2 / 3.0
+    shares = {f"{name}/inertia": truth[name] / inertia for name in ("viscous", "coulomb")}
+    check(found, {**truth["products"], **shares})
+    assert found.actuator.delay_steps == truth["delay"]
     assert found.constants["mass"].verdict.startswith("only in combination with gain")
 
 
@@ -158,16 +154,10 @@ def test_the_tanks() -> None:
         if len(part) > 1
     ]
     found = identify(make_task(Tanks(), 0.0, 1.0, 1.0), logs)
-    check(
-        found,
-        {
-            "area_2 / area_1": 1.0,
-            "outlet_1 / area_1": 4.1e-5 / 0.0154,
-            "outlet_2 / area_1": 3.3e-5 / 0.0154,
-            "flow / area_1": 9e-5 / 0.0154,
-        },
-    )
-    assert found.actuator.lag_s == pytest.approx(3.0, rel=0.2)
+    truth = TRUTH["tanks"]
+    names = ("area_2", "outlet_1", "outlet_2", "flow")
+    check(found, {f"{name} / area_1": truth[name] / truth["area_1"] for name in names})
+    assert found.actuator.lag_s == pytest.approx(truth["lag"], rel=0.2)
     assert {"clock", "gaps", "combination"} <= {warning.code for warning in found.warnings}
 
 
@@ -179,13 +169,7 @@ def test_the_rail() -> None:
     found = identify(
         make_task(Rail(), -6.0, 6.0, 0.01), [Recording(time, state, force[:, None], "rail.csv")]
     )
-    truth = {
-        "cart": 0.52,
-        "pole": 0.21,
-        "half": 0.17,
-        "cart_coulomb": 0.35,
-        "pole_viscous": 0.0015,
-    }
-    check(found, truth)
+    truth = TRUTH["rail"]
+    check(found, {name: truth[name] for name in found.constants})
     assert found.actuator.actuator is None
-    assert found.stops["x"] == pytest.approx((-0.4, 0.4), abs=0.002)
+    assert found.stops["x"] == pytest.approx((-truth["stop"], truth["stop"]), abs=0.002)
