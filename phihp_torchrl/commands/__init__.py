@@ -1,4 +1,4 @@
-"""The console command ``phihp`` (train, evaluate, export, list), and ``learn`` for Python.
+"""The console command ``phihp`` (train, evaluate, identify, export, list), and ``learn``.
 
 Modules are imported when they are used, so that ``--help`` does not import torch.
 """

@@ -10,6 +10,7 @@ from typing import Any
 COMMANDS = {
     "train": "learn a model, a policy and a planner: phihp train task=acrobot",
     "evaluate": "play a trained agent: phihp evaluate agent=results/agents/acrobot",
+    "identify": "fit the constants of a task's system to recordings or steps, and report on them",
     "export": "write an agent's plan as one file: phihp export agent=DIR formats=[onnx]",
     "list": "print tasks, methods, presets, worlds and planners, a line each",
 }

@@ -19,6 +19,7 @@ import yaml
 
 import phihp_torchrl.tdmpc  # noqa: F401  (it registers its phase)
 from phihp_torchrl.config import METHODS, YAML, default_of, sentences_of
+from phihp_torchrl.identification import IdentifyConfig
 from phihp_torchrl.planners import PLANNERS
 from phihp_torchrl.trainers import PHASES, LoggerConfig, RunConfig
 from phihp_torchrl.worlds import WORLDS
@@ -36,6 +37,8 @@ def mirror() -> dict[Path, str]:
                 lines = [_HEAD, f"# {kind.about}", "", f"# which kind of {group}", f"kind: {name}"]
                 text = "\n".join([*lines, *_section(kind.config, 0)])
                 texts[Path(group, f"{name}.yaml")] = f"{text}\n"
+    text = "\n".join([_HEAD, "# phihp identify: how recordings are fitted", ""])
+    texts[Path("identify.yaml")] = "\n".join([text, *_section(IdentifyConfig, 0)]) + "\n"
     for name, about in (
         ("csv", "metrics.csv in the run directory, and nothing else"),
         ("tensorboard", "TensorBoard beside metrics.csv (extra tensorboard)"),

@@ -28,7 +28,7 @@ def main(words: Sequence[str] | None = None, *, method: str = "phihp") -> None:
         words.append(f"method={method}")
     try:
         lines = read_lines(settings)
-        task = _task_of_world(lines)
+        task = task_of_world(lines)
         settings, words = [*settings, *task], [*words, *task]
         if any(word in ("-h", "--help") for word in words):
             print(help_text(settings, config_dir))  # noqa: T201 (a console command)
@@ -63,7 +63,7 @@ def split_flags(words: Sequence[str]) -> tuple[list[str], str | None]:
     return settings, config_dir
 
 
-def _task_of_world(lines: Mapping[str, Override]) -> list[str]:
+def task_of_world(lines: Mapping[str, Override]) -> list[str]:
     """The task that a world speaks of, where none is named and the world knows one."""
     if {"task", "resume"} & set(lines) or "world" not in lines:
         return []

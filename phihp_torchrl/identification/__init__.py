@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from phihp_torchrl.identification.config import IdentifyConfig
 from phihp_torchrl.identification.identify import identify
+from phihp_torchrl.identification.page import report_page
 from phihp_torchrl.identification.parts import (
     ActuatorEstimate,
     ActuatorTrial,
@@ -15,6 +16,7 @@ from phihp_torchrl.identification.parts import (
     Rollout,
     StateError,
 )
+from phihp_torchrl.identification.paste import ready_to_paste
 from phihp_torchrl.identification.result import Identification
 
-__all__ = ["Identification", "IdentifyConfig", "identify"]
+__all__ = ["Identification", "IdentifyConfig", "identify", "report_page"]

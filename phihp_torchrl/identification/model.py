@@ -11,7 +11,7 @@ from torch import Tensor
 from phihp_torchrl.dynamics import PhysicsPrior
 from phihp_torchrl.identification.response import respond
 from phihp_torchrl.identification.windows import Samples
-from phihp_torchrl.integrators import RK4, Integrator, StateLayout
+from phihp_torchrl.integrators import Integrator, StateLayout
 from phihp_torchrl.tasks import Actuator
 
 PARTS = ("delay_steps", "lag", "slew", "dead_zone", "gain_low")
@@ -101,9 +101,7 @@ class Model:
         def derivative(s: Tensor) -> Tensor:
             return system.prior(s, acting, constants)
 
-        # Runge-Kutta adds whole states, the semi-implicit step one component after the other.
-        time = seconds[..., None] if isinstance(self.integrator, RK4) else seconds
-        return self.integrator(derivative, state, time, self.layout)
+        return self.integrator(derivative, state, seconds[..., None], self.layout)
 
     def slopes(
         self,

@@ -91,8 +91,7 @@ def gather(system: System, recordings: Sequence[Recording]) -> Samples:
 
 
 def _follows(before: Recording, after: Recording) -> bool:
-    same = (before.source, before.episode) == (after.source, after.episode)
-    return same and bool(after.time[0] > before.time[-1])
+    return before.episode == after.episode and bool(after.time[0] > before.time[-1])
 
 
 class Windows(NamedTuple):

@@ -11,6 +11,7 @@ from phihp_torchrl.trainers.model import ModelConfig, ModelTrainer, make_dynamic
 from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_phase
 from phihp_torchrl.trainers.plugins import import_plugins
 from phihp_torchrl.trainers.policy import PolicyConfig, PolicyTrainer
+from phihp_torchrl.trainers.record import record
 from phihp_torchrl.trainers.results import read_result
 from phihp_torchrl.trainers.run import RunResult, run
 from phihp_torchrl.trainers.run_config import (
@@ -21,7 +22,7 @@ from phihp_torchrl.trainers.run_config import (
     read_run_config,
     task_of,
 )
-from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
+from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory, write_atomically
 from phihp_torchrl.trainers.td3 import RealTD3Config, RealTD3Trainer
 
 __all__ = [

@@ -39,7 +39,7 @@ def test_the_commands_are_listed(phihp: Command, capsys: pytest.CaptureFixture[s
         phihp(*words)
         text = out(capsys)
         assert text.startswith("usage: phihp COMMAND")
-        for command in ("train", "evaluate", "export", "list"):
+        for command in ("train", "evaluate", "identify", "export", "list"):
             assert f"\n  {command} " in text
 
 
@@ -120,7 +120,7 @@ def test_the_list_has_all_there_is(phihp: Command, capsys: pytest.CaptureFixture
         assert all(len(line.split()) > 1 for line in lines), "each with a word on what it is"
 
 
-@pytest.mark.parametrize("command", ["evaluate", "export", "list"])
+@pytest.mark.parametrize("command", ["evaluate", "identify", "export", "list"])
 def test_the_other_commands_explain_their_settings(
     phihp: Command, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:

@@ -16,7 +16,8 @@ PAGES = {
 SHELLS = ("sh", "bash", "shell", "console")
 _FENCE = re.compile(r'^(?P<indent> *)```(?P<language>\w*)(?: +title="(?P<title>[^"]+)")? *$')
 _INLINE = re.compile(
-    r"`((?:phihp (?:train|evaluate|export) \w|phihp list|python (?:-m )?\w[\w./]+)[^`\n]*)`"
+    r"`((?:phihp (?:train|evaluate|identify|export) \w|phihp list|python (?:-m )?\w[\w./]+)"
+    r"[^`\n]*)`"
 )
 _OPEN = re.compile(r"\.\.\.|=NAME")  # what a reader has to fill in
 _MARK = re.compile(r"^ *<!-- example: (?P<mark>slow|not run: .+?) -->$")

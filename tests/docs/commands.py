@@ -9,10 +9,13 @@ from importlib.util import find_spec
 from phihp_torchrl.commands.console import COMMANDS
 from phihp_torchrl.commands.evaluate import PlayConfig
 from phihp_torchrl.commands.export import ExportConfig
+from phihp_torchrl.commands.identify import IdentifyJob
+from phihp_torchrl.commands.identifying import SHARED
 from phihp_torchrl.commands.list import ListConfig
 from phihp_torchrl.commands.train import split_flags
 from phihp_torchrl.commands.words import read_words
-from phihp_torchrl.config import load_config, override_key, parse_overrides
+from phihp_torchrl.config import from_mapping, load_config, override_key, parse_overrides
+from phihp_torchrl.identification import IdentifyConfig
 from phihp_torchrl.trainers import import_plugins, read_run_config
 from tests.docs.blocks import ROOT
 
@@ -40,6 +43,8 @@ def _check_phihp(command: str, words: list[str], method: str | None = None) -> N
     assert command in COMMANDS, f"phihp has no command {command!r}"
     if command == "train":
         _check_train(words, method)
+    elif command == "identify":
+        _check_identify(words)
     elif command == "list":
         read_words(ListConfig, words)
     else:
@@ -60,6 +65,15 @@ def _check_train(words: list[str], method: str | None) -> None:
         import_plugins(list(named["plugins"].value()))
     composed = load_config(overrides=settings, config_dir=config_dir)
     read_run_config(composed, given=list(named))
+
+
+def _check_identify(words: list[str]) -> None:
+    settings, config_dir = split_flags(words)
+    job = read_words(IdentifyJob, settings)
+    import_plugins(job.plugins)
+    from_mapping(IdentifyConfig, job.identify)
+    shared = [word for word in settings if word.split("=")[0].split(".")[0] in SHARED]
+    load_config(overrides=shared, config_dir=config_dir)
 
 
 def _check_script(script: str, words: list[str]) -> None:
