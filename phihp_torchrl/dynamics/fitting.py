@@ -142,7 +142,9 @@ def fit(
     if config.scaled:
         loss.set_scales(train)
     method = _adam if config.method == "adam" else _levenberg_marquardt
-    steps = method(loss, train, held_out, config, generator)
+    # A prior whose constants are all fixed has nothing to fit.
+    open_ = any(parameter.numel() for parameter in loss.dynamics.parameters())
+    steps = method(loss, train, held_out, config, generator) if open_ else 0
     return FitReport(
         train_error=_error(loss, train),
         held_out_error=_error(loss, held_out),

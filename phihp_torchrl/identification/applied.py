@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.identification.parts import ActuatorEstimate, Estimate
+from phihp_torchrl.identification.parts import IDENTIFIED, ActuatorEstimate, Estimate
 from phihp_torchrl.identification.paste import actuator_of
 from phihp_torchrl.identification.result import Identification
 from phihp_torchrl.systems import Constant
@@ -18,7 +18,7 @@ _INSIDE = 1e-3
 """How far inside its range a first guess stays, as a share of it: its limits are not allowed."""
 
 
-def identified_task(task: Task, report: str | Path) -> Task:
+def identified_task(task: Task, report: str | Path, *, fixed: bool = False) -> Task:
     """Return the task with the constants, the actuator and the stops of an identification.
 
     The constants become first guesses, which training goes on to fit. Fixed ones stay, and so do
@@ -28,6 +28,9 @@ def identified_task(task: Task, report: str | Path) -> Task:
         task: the task that was identified.
         report: ``identification.json``, which ``phihp identify`` and
             :meth:`Identification.save` write, or the directory that it is in.
+        fixed: whether training keeps the constants that are identified as they are. Training fits
+            single steps from the measured states, and so noise, or a velocity that was estimated,
+            biases its constants, while an identification is not biased by them.
 
     Raises:
         ConfigError: for a file that is absent or no such report, and for one of another system.
@@ -56,9 +59,12 @@ def identified_task(task: Task, report: str | Path) -> Task:
         if not declared.fixed:
             constants[name] = _inside(declared, estimate.estimate)
     system = task.system.with_constants(constants)
+    if fixed:
+        known = [name for name in constants if found.constants[name].verdict == IDENTIFIED]
+        system.ranges |= {n: replace(system.ranges[n], fixed=True) for n in known}
     return replace(
         task,
-        system=task.system.with_constants(constants),
+        system=system,
         actuator=actuator_of(task, found) or task.actuator,
         position_limits={**found.stops, **task.position_limits},
     )
