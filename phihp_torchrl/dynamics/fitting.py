@@ -1,4 +1,4 @@
-"""Fitting a model to transitions: by Adam, as published, or by Levenberg-Marquardt."""
+"""Fitting a model to transitions: by Adam, as published, or by least squares."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from torch.func import functional_call, jacrev, vmap
 
 from phihp_torchrl.config import ConfigError, check_choice, check_count, check_positive
 from phihp_torchrl.dynamics.loss import DynamicsLoss
+from phihp_torchrl.dynamics.shooting import multiple_shooting
 
 
 @dataclass(frozen=True)
@@ -21,21 +22,24 @@ class FitConfig:
     """How a model is fitted to transitions.
 
     Args:
-        method: ``"levenberg_marquardt"`` or ``"adam"``. The model is small and its loss is a sum of
-            squares, so a second-order method reaches within seconds errors that Adam never reaches.
+        method: ``"levenberg_marquardt"``, ``"multiple_shooting"`` or ``"adam"``. The model is small
+            and its loss is a sum of squares, so a second-order method reaches within seconds errors
+            that Adam never reaches. Multiple shooting is for noisy sensors: it fits trajectories
+            whose starts are free.
         steps: number of optimization steps.
         scaled: whether errors are measured in units of one-step changes
             (:meth:`DynamicsLoss.set_scales`), or in raw units as published.
         batch_size: transitions per step; ``None`` for all of them, as published.
         learning_rate: learning rate of Adam.
         cosine_decay: whether the learning rate of Adam decays to zero.
-        initial_lambda: first value of λ for Levenberg-Marquardt. A small one lets the prior explain
-            as much as it can before the residual contributes.
-        final_lambda: last value of λ for Levenberg-Marquardt.
-        patience: Levenberg-Marquardt stops after this many steps at its final λ in which the
-            held-out error did not fall by a tenth.
-        shuffle_actions: whether the penalty of Levenberg-Marquardt pairs each state with the action
-            of another transition. A controller's actions are correlated with the velocities, so
+        initial_lambda: first value of λ for methods of least squares. A small one lets the prior
+            explain as much as it can before the residual contributes.
+        final_lambda: last value of λ for them.
+        patience: they stop after this many steps at the final λ in which the held-out error did not
+            fall by a tenth (multiple shooting: by a hundredth).
+        window: steps in a trajectory of multiple shooting.
+        shuffle_actions: whether the penalty on F^r of Levenberg-Marquardt pairs each state with the
+            action of another transition. A controller's actions are correlated with the velocities, so
             that the smallest F^r on the pairs as recorded would explain friction by a wrong effect
             of the action.
 
@@ -46,8 +50,8 @@ class FitConfig:
         >>> FitConfig(method="newton")
         Traceback (most recent call last):
         ...
-        phihp_torchrl.config.ConfigError: method: expected one of ['levenberg_marquardt', 'adam'], \
-got 'newton'.
+        phihp_torchrl.config.ConfigError: method: expected one of ['levenberg_marquardt', \
+'multiple_shooting', 'adam'], got 'newton'.
     """
 
     method: str = "levenberg_marquardt"
@@ -59,11 +63,12 @@ got 'newton'.
     initial_lambda: float = 1e-2
     final_lambda: float = 1e7
     patience: int = 8
+    window: int = 20
     shuffle_actions: bool = True
 
     def __post_init__(self) -> None:
-        check_choice(self, "method", ("levenberg_marquardt", "adam"))
-        check_count(self, "steps", "patience")
+        check_choice(self, "method", _METHODS)
+        check_count(self, "steps", "patience", "window")
         check_positive(self, "learning_rate", "initial_lambda", "final_lambda")
         if self.batch_size is not None:
             check_count(self, "batch_size")
@@ -98,8 +103,8 @@ def fit(
     Args:
         loss: the loss of the model; its λ and scales are changed as well.
         train: transitions ``[N]`` to learn from.
-        held_out: transitions ``[M]`` on which the error is measured; Levenberg-Marquardt keeps the
-            parameters with the smallest error on them.
+        held_out: transitions ``[M]`` on which the error is measured; methods of least squares keep
+            the parameters with the smallest error on them.
         config: method and hyper-parameters of the fit.
         generator: source of mini-batches. Defaults to torch's global generator.
 
@@ -108,8 +113,8 @@ def fit(
 
     Raises:
         ValueError: if there are no transitions, or some are not finite.
-        ConfigError: for Levenberg-Marquardt with an integrator that chooses its own steps, which
-            cannot be differentiated row by row.
+        ConfigError: for least squares with an integrator that chooses its own steps, which cannot
+            be differentiated row by row.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -132,7 +137,7 @@ def fit(
         # Check the observations, because atan2 makes a finite angle of infinite cosines and sines.
         if not all(data.get(key).isfinite().all() for key in loss.in_keys):
             raise ValueError(f"{name}: expected finite transitions, got some that are not.")
-    if config.method == "levenberg_marquardt" and not loss.dynamics.integrator.compiles:
+    if config.method != "adam" and not loss.dynamics.integrator.compiles:
         raise ConfigError(
             "method",
             "expected 'adam' for a model that is integrated by "
@@ -141,9 +146,9 @@ def fit(
     start = time.perf_counter()
     if config.scaled:
         loss.set_scales(train)
-    method = _adam if config.method == "adam" else _levenberg_marquardt
     # A prior whose constants are all fixed has nothing to fit.
     open_ = any(parameter.numel() for parameter in loss.dynamics.parameters())
+    method = _METHODS[config.method]
     steps = method(loss, train, held_out, config, generator) if open_ else 0
     return FitReport(
         train_error=_error(loss, train),
@@ -236,6 +241,13 @@ def _timed(loss: DynamicsLoss, data: TensorDictBase) -> tuple[Tensor, ...]:
     """The arguments of :meth:`DynamicsLoss.terms`, with time steps where the data have them."""
     transition, seconds = loss.transitions(data), loss.time_step(data)
     return transition if seconds is None else (*transition, transition[1], seconds)
+
+
+_METHODS = {
+    "levenberg_marquardt": _levenberg_marquardt,
+    "multiple_shooting": multiple_shooting,
+    "adam": _adam,
+}
 
 
 class _LeastSquares:

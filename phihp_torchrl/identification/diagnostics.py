@@ -28,7 +28,6 @@ BEFORE = 5
 """How many previous commands are looked at."""
 _EXPLAINED = 0.1
 _WHITE = 0.3
-_JITTER = 0.02
 _OVER = 2.0
 _EXACT = 1e-5  # residuals below this share of the motion are those of the integrator
 
@@ -48,73 +47,6 @@ def of_constants(constants: Mapping[str, Estimate]) -> list[Finding]:
     for advice, names in groups.items():
         text = f"Of {', '.join(names)} only combinations are identified."
         found.append(Finding("combination", text, advice))
-    return found
-
-
-def of_recordings(system: System, samples: Samples) -> list[Finding]:
-    """Clock, missing samples, commands that never change, velocities that are none."""
-    found = []
-    inside = samples.stretch[1:] == samples.stretch[:-1]
-    intervals = samples.interval[:-1][inside]
-    spread = float(intervals.std() / intervals.mean()) if len(intervals) > 1 else 0.0
-    if spread > _JITTER:
-        found.append(
-            Finding(
-                "clock",
-                f"The clock is irregular: intervals of {float(intervals.min()):.3g} to "
-                f"{float(intervals.max()):.3g} s, {100 * spread:.0f} % of the mean apart.",
-                "Each interval was integrated as it is; keep the stamps, and do not resample.",
-            )
-        )
-    same_episode = samples.first[1:] == samples.first[:-1]
-    gaps = int((~inside & same_episode).sum())
-    if gaps:
-        found.append(
-            Finding(
-                "gaps",
-                f"{gaps} gaps interrupt the episodes.",
-                "No window goes over a gap; for the actuator, the last command is held in it. Log "
-                "without losses if the path of the command matters.",
-            )
-        )
-    for i, name in enumerate(system.action_names):
-        if not float(samples.action[:, i].std()) > 0:
-            found.append(
-                Finding(
-                    "excitation",
-                    f"{name} never changes.",
-                    "Nothing can be learned of what it does; record a motion that uses it.",
-                )
-            )
-    return found + _velocities(system, samples)
-
-
-def _velocities(system: System, samples: Samples) -> list[Finding]:
-    """Velocities that are not the slope of their position, over ten samples."""
-    found = []
-    apart = min(10, len(samples.time) - 1)
-    same = samples.stretch[apart:] == samples.stretch[:-apart]
-    for position, velocity in system.velocity_of.items():
-        q, v = (samples.state[:, system.state_names.index(name)] for name in (position, velocity))
-        area = (v[1:] + v[:-1]) / 2 * samples.interval[:-1]
-        whole = torch.cat([area.new_zeros(1), area.cumsum(0)])
-        moved, expected = q[apart:] - q[:-apart], whole[apart:] - whole[:-apart]
-        good = same & moved.isfinite() & expected.isfinite()
-        if int(good.sum()) < 20:
-            continue
-        moved, expected = moved[good], expected[good]
-        slope = float((moved * expected).sum() / expected.square().sum().clamp_min(1e-300))
-        left = float((moved - expected).square().mean() / moved.square().mean().clamp_min(1e-300))
-        if abs(slope - 1.0) > 0.1 and left > 0.05:
-            found.append(
-                Finding(
-                    "velocity",
-                    f"{velocity} is not the slope of {position}: {position} moves {slope:.3g} "
-                    "times as far as it says.",
-                    "Check units and sign of the column, or leave it out: velocities need not be "
-                    "measured.",
-                )
-            )
     return found
 
 

@@ -15,7 +15,8 @@ from phihp_torchrl.identification.division import LEAST, TRIAL, Division, divide
 from phihp_torchrl.identification.held_out import Span
 from phihp_torchrl.identification.model import Model
 from phihp_torchrl.identification.parts import ActuatorTrial
-from phihp_torchrl.identification.shooting import Fit, Shooting, settle
+from phihp_torchrl.identification.settling import settle
+from phihp_torchrl.identification.shooting import Fit, Shooting
 from phihp_torchrl.identification.stops import check_stops, suspect_stops
 from phihp_torchrl.identification.trials import WINDOWS, Trials
 from phihp_torchrl.identification.windows import (

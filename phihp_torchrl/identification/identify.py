@@ -15,6 +15,7 @@ from phihp_torchrl.identification.covariance import uncertainty
 from phihp_torchrl.identification.errors import judge_predictions
 from phihp_torchrl.identification.experiments import Experiments
 from phihp_torchrl.identification.fitting import Fitted, fit_recordings
+from phihp_torchrl.identification.logs import of_recordings
 from phihp_torchrl.identification.result import Identification
 from phihp_torchrl.identification.stops import noise_level
 from phihp_torchrl.identification.verdicts import (
@@ -100,7 +101,7 @@ def _report(
     more, residuals = diagnostics.of_residuals(system, samples, fitted.windows, fit)
     warnings = [
         *diagnostics.of_constants(constants),
-        *diagnostics.of_recordings(system, samples),
+        *of_recordings(system, samples),
         *more,
         *diagnostics.of_fit(division.stopped, division.stops, fitted),
         *diagnostics.of_errors(judged.errors),

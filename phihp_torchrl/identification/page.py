@@ -152,7 +152,7 @@ def _warnings(found: Identification) -> str:
 def _data(found: Identification) -> str:
     elsewhere = ("noise_without_model", "notes")
     facts = {k: v for k, v in found.data.items() if k not in elsewhere}
-    settings = {**found.settings, "seconds of the fit": found.seconds}
+    settings = {**found.settings, "stops": found.stops, "seconds of the fit": found.seconds}
     items = "".join(f"<li>{escape(note)}</li>" for note in found.data.get("notes", ()))
     told = f"<h3>What was left out, and why</h3>\n<ul>{items}</ul>\n" if items else ""
     return f"{_facts(facts)}{told}<h3>How it was fitted</h3>\n{_facts(settings)}"

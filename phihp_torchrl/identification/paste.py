@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -36,17 +37,27 @@ def ready_to_paste(task: Task, found: Identification) -> dict[str, str]:
         default_constants = {
             "length": 1.2,
         }
-        actuator=Actuator(delay_steps=2.0),
         actuator: {delay_steps: 2.0}
+        actuator=Actuator(delay_steps=2.0),
     """
     lines = {f"{type(task.system).__name__}, in Python": "\n".join(_constants(task, found))}
+    given: list[str] = []
     actuator = actuator_of(task, found)
     if actuator is not None:
         numbers = {name: _rounded(value) for name, value in actuator.config.items()}
         python = ", ".join(f"{name}={value}" for name, value in numbers.items())
         yaml = ", ".join(f"{name}: {value}" for name, value in numbers.items())
-        lines["Task(...), in Python"] = f"actuator=Actuator({python}),"
-        lines[f"or the settings of {task.name}, in YAML"] = f"actuator: {{{yaml}}}"
+        given.append(f"actuator=Actuator({python}),")
+        lines[f"the actuator in the settings of {task.name}, in YAML"] = f"actuator: {{{yaml}}}"
+    if new := {
+        name: pair for name, pair in found.stops.items() if name not in task.position_limits
+    }:
+        pairs = (
+            f'"{name}": ({_rounded(low)}, {_rounded(high)})' for name, (low, high) in new.items()
+        )
+        given.append(f"position_limits={{{', '.join(pairs)}}},")
+    if given:
+        lines["Task(...), in Python"] = "\n".join(given)
     return lines
 
 
@@ -78,4 +89,6 @@ def _constants(task: Task, found: Identification) -> Iterator[str]:
 
 def _rounded(value: object) -> str:
     """Six digits, which is more than any log tells."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return f'float("{value}")'
     return repr(float(f"{value:.6g}")) if isinstance(value, float) else repr(value)

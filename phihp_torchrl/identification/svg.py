@@ -95,9 +95,9 @@ def interval_bar(guess: float, estimate: float, low: float | None, high: float |
     """An estimate with its interval, and the first guess, on one scale; for a cell of a table.
 
     Examples:
-        >>> "interval" in interval_bar(1.0, 1.2, 1.1, 1.3), "interval" in interval_bar(1, 1, 1, 1)
+        >>> "<rect" in interval_bar(1.0, 1.2, 1.1, 1.3), "<rect" in interval_bar(1, 1, 1, 1)
         (True, True)
-        >>> "interval" in interval_bar(1.0, 1.2, None, None)
+        >>> "<rect" in interval_bar(1.0, 1.2, None, None)
         False
     """
     ends = (low, high) if low is not None and high is not None else (None, None)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.identification.model import Model
-from phihp_torchrl.identification.shooting import Shooting, noise, robust
+from phihp_torchrl.identification.settling import noise
+from phihp_torchrl.identification.shooting import Shooting, robust
 from phihp_torchrl.identification.windows import Samples, Windows, first_starts
 
 WINDOWS = 160
@@ -91,9 +92,11 @@ class Trials:
         return float(total)
 
     def better(self, trial: Trial, best: Trial) -> bool:
-        """Whether windows are better by three standard errors of pairs, and by half a percent."""
+        """Whether windows are better by three standard errors (or all), and by half a percent."""
         sigma = self.noise(best)
         gain = self.losses(best, sigma) - self.losses(trial, sigma)
         error = gain.std() / len(gain) ** 0.5
         whole = self.losses(best, sigma).sum()
-        return bool((gain.mean() > _CLEAR * error) & (gain.sum() > _WORTH * whole))
+        clear = bool(gain.mean() > _CLEAR * error)
+        everywhere = bool((gain > 0).all()) and len(gain) >= 5  # few windows, but all of them
+        return (clear or everywhere) and bool(gain.sum() > _WORTH * whole)

@@ -11,6 +11,7 @@ import torch
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.identification import Identification, IdentifyConfig, identify
+from phihp_torchrl.integrators import make_integrator
 from phihp_torchrl.recordings import Recording
 from phihp_torchrl.tasks import Actuator
 from tests.identification.rigs import MASS, ROD, Mass, Rod, make_task, record
@@ -214,3 +215,18 @@ def test_recordings_that_do_not_fit_are_refused() -> None:
     log = record(Mass(), MASS, samples=40)
     with pytest.raises(ConfigError, match="unknown state"):
         identify(task, [log], IdentifyConfig(stops={"y": (0.0, 1.0)}))
+
+
+def test_a_rig_that_was_simulated_by_eulers_steps_is_integrated_so() -> None:
+    state, states = torch.tensor([0.3, 0.0]).double(), []
+    command = (5.0 * torch.sin(torch.arange(400) ** 1.5 / 40.0)).double()[:, None]
+    truth, layout = Mass().with_constants(MASS), Mass().layout()
+    solver = make_integrator("semi_implicit_euler")
+    for u in command:
+        states.append(state)
+        state = solver(lambda s, u=u: truth.prior(s, u, truth.constants), state, 0.05, layout)
+    log = Recording(0.05 * torch.arange(400), torch.stack(states), command)
+    settings = {**PLAIN, "integrator": "auto", "substeps": 0}
+    found = identify(make_task(Mass(), step=0.05), [log], IdentifyConfig(**settings))
+    assert found.settings["integrator"] == "semi_implicit_euler"
+    assert found.constants["stiffness"].estimate == pytest.approx(MASS["stiffness"], rel=1e-3)

@@ -119,7 +119,7 @@ def test_the_page_is_well_formed_and_has_every_part() -> None:
     text = " ".join(" ".join(reader.text).split())
     for words in (
         "A rod", "The clock jitters.", "What to do: Keep its stamps.",
-        "Line 9: a row was left out.", "✓ identified, ± 0.032 %", 
+        "Line 9: a row was left out.", "✓ identified, ± 0.032 %",
         "◐ only in combination with drag", "Spin it.",
         "✗ not identified by these data", "▲ at its limit", "■ fixed",
         "gain / drag", "0.3099 to 0.3101",
@@ -229,13 +229,19 @@ class Rod(System):
 def test_what_is_pasted_is_python_and_makes_the_fitted_task() -> None:
     box = Box((0.0,), (1.0,))
     task = Task("rod", Rod(), (1.0,), 0.01, 10, box, lambda s, a, n: s[..., 0])
-    lines = ready_to_paste(task, sample())
+    found = replace(sample(), stops={"angle": (-math.inf, 0.4)})
+    lines = ready_to_paste(task, found)
     names = {"Constant": Constant, "Actuator": Actuator}
     exec(lines["Rod, in Python"], names)
     constants = names["default_constants"]
     assert constants["mass"] == 0.31  # type: ignore[index]
     assert constants["tilt"] == Constant(0.1996, low=-0.2, high=0.2)  # type: ignore[index]
     assert constants["gravity"] == Constant(9.81, fixed=True)  # type: ignore[index]
-    actuator = eval(f"dict({lines['Task(...), in Python']})", names)["actuator"]
+    given = eval(f"dict({lines['Task(...), in Python']})", names)
+    actuator = given["actuator"]
+    assert given["position_limits"] == {"angle": (-math.inf, 0.4)}
     assert actuator == Actuator(delay_steps=4.0, lag=0.05), "in steps of the task, half as long"
-    assert lines["or the settings of rod, in YAML"] == "actuator: {delay_steps: 4.0, lag: 0.05}"
+    assert (
+        lines["the actuator in the settings of rod, in YAML"]
+        == "actuator: {delay_steps: 4.0, lag: 0.05}"
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, cast
 
@@ -11,6 +12,7 @@ import torch
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.integrators import Integrator, make_integrator
 from phihp_torchrl.tasks import Actuator, Task, find_task
 from phihp_torchrl.worlds.simulated.plant import Plant, find_plant
@@ -30,6 +32,8 @@ class TaskEnv(gym.Env[Any, Any]):
         integrator: name of the integrator, or an instance. Defaults to semi-implicit Euler.
         plant: true constants and friction. Defaults to the plant registered for the task's system.
         actuator: what happens to a command before it acts. Defaults to the task's.
+        noise: standard deviation of what the sensors show, by name of the state; the world itself
+            moves without noise. Defaults to none.
         render_mode: one of ``metadata["render_modes"]``, or ``None``.
 
     Raises:
@@ -51,6 +55,7 @@ class TaskEnv(gym.Env[Any, Any]):
         integrator: str | Integrator | None = None,
         plant: Plant | None = None,
         actuator: Actuator | None = None,
+        noise: Mapping[str, float] | None = None,
         render_mode: str | None = None,
     ) -> None:
         super().__init__()  # in a subclass: what gymnasium's environment needs for drawing
@@ -60,6 +65,7 @@ class TaskEnv(gym.Env[Any, Any]):
         self.plant = plant or find_plant(self.task.system)
         self.integrator = make_integrator(integrator or "semi_implicit_euler")
         self.layout = self.task.layout.coupled(self.plant.impulse)
+        self.noise = _sensor_noise(self.task, noise or {})
         modes = [None, *self.metadata["render_modes"]]
         if render_mode not in modes:
             raise ValueError(f"render_mode: expected one of {modes}, got {render_mode!r}.")
@@ -122,6 +128,9 @@ class TaskEnv(gym.Env[Any, Any]):
         )
 
     def _observe(self, state: torch.Tensor) -> NDArray[np.float32]:
+        if self.noise.any():
+            drawn = self.np_random.standard_normal(len(self.noise))
+            state = state + torch.from_numpy(self.noise * drawn)
         return cast(NDArray[np.float32], self.task.system.observe(state).float().numpy())
 
     def _checked_state(self, value: ArrayLike) -> NDArray[np.float64]:
@@ -131,6 +140,17 @@ class TaskEnv(gym.Env[Any, Any]):
     def _checked_action(self, value: ArrayLike) -> NDArray[np.float64]:
         low, high = self.task.action_low, self.task.action_high
         return _checked("action", value, len(high), f"finite values, bounds {low} to {high}")
+
+
+def _sensor_noise(task: Task, noise: Mapping[str, float]) -> NDArray[np.float64]:
+    """Standard deviations ``[n]`` in the order of the states."""
+    names = task.system.state_names
+    if unknown := sorted(set(noise) - set(names)):
+        raise ConfigError("noise", f"unknown {unknown}, expected some of {list(names)}.")
+    for name, value in noise.items():
+        if not 0 <= value < np.inf:
+            raise ConfigError(f"noise.{name}", f"expected a number of at least 0, got {value}.")
+    return np.array([noise.get(name, 0.0) for name in names], dtype=np.float64)
 
 
 def _checked(what: str, value: ArrayLike, size: int, expected: str) -> NDArray[np.float64]:

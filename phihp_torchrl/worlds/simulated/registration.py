@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -44,7 +45,8 @@ def make_task_env(task: str | Task, **options: Any) -> TaskEnv:
 
     Args:
         task: a task or the name of a registered one.
-        options: ``integrator``, ``plant``, ``actuator`` and ``render_mode`` of
+        options: ``integrator``, ``plant``, ``actuator``, ``noise`` and
+            ``render_mode`` of
             :class:`~phihp_torchrl.worlds.TaskEnv`.
 
     Examples:
@@ -61,6 +63,7 @@ def make_limited_env(
     integrator: str | Integrator | None = None,
     plant: Plant | None = None,
     actuator: Actuator | None = None,
+    noise: Mapping[str, float] | None = None,
     render_mode: str | None = None,
 ) -> gym.Env[Any, Any]:
     """Make the simulated world of a task, truncated after ``max_steps``, for ``phihp/Task-v0``.
@@ -70,6 +73,7 @@ def make_limited_env(
         integrator: name of the integrator, or an instance.
         plant: true constants and friction.
         actuator: what happens to a command before it acts. Defaults to the task's.
+        noise: standard deviation of what the sensors show, by name of the state.
         render_mode: ``"human"`` or ``"rgb_array"`` if the task's system is one of the paper's.
 
     Examples:
@@ -78,7 +82,6 @@ def make_limited_env(
         'pendulum-swingup'
     """
     task = find_task(task)
-    env = make_task_env(
-        task, integrator=integrator, plant=plant, actuator=actuator, render_mode=render_mode
-    )
+    options = {"integrator": integrator, "plant": plant, "actuator": actuator, "noise": noise}
+    env = make_task_env(task, **options, render_mode=render_mode)
     return TimeLimit(env, max_episode_steps=task.max_steps)

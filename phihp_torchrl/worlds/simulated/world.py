@@ -33,6 +33,7 @@ class SimulatedConfig:
         constants: true constants that differ from the system's first guesses, by name.
         friction: friction coefficients that differ from the plant's defaults, by name.
         actuator: numbers in which the actuator of the world differs from the task's, by name.
+        noise: standard deviation of what the sensors show, by name of the state.
 
     Raises:
         ConfigError: for an unknown integrator or a number of substeps that is not positive.
@@ -50,6 +51,7 @@ class SimulatedConfig:
     constants: Mapping[str, float] = field(default_factory=dict, hash=False)
     friction: Mapping[str, float] = field(default_factory=dict, hash=False)
     actuator: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    noise: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         check_integrator(self)
@@ -100,10 +102,11 @@ class SimulatedWorld(World):
     def model(self) -> TaskWorldModel | None:
         """Return the world as an exact model, of any batch shape.
 
-        There is none where the world treats commands otherwise than the task says.
+        There is none where the world treats commands otherwise than the task says, or where its
+        sensors are noisy.
         """
-        same = self.actuator == self.task.actuator
-        return TaskWorldModel(self.task, self.oracle()) if same else None
+        exact = self.actuator == self.task.actuator and not any(self.config.noise.values())
+        return TaskWorldModel(self.task, self.oracle()) if exact else None
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
@@ -116,6 +119,7 @@ class SimulatedWorld(World):
             plant=self._plant,
             integrator=self.integrator,
             actuator=self.actuator,
+            noise=self.config.noise,
             render_mode="rgb_array" if render else None,
         )
         return TransformedEnv(GymWrapper(env), Compose(StepCounter(), *command_memory(self.task)))
