@@ -44,14 +44,14 @@ def test_a_tutorial_runs_as_printed(page, place):
     needs = {"docs/tutorials/simulator.md": "dm_control"}
     if page in needs:
         pytest.importorskip(needs[page])
-    namespace: dict[str, Any] = {"__name__": "printed"}
-    with background() as started, as_before(place):
+    with background() as started:
         for block in BLOCKS[page]:
             if block.language in SHELLS:
                 for line in block.text.replace("\\\n", " ").strip().splitlines():
                     run_line(line, place, started)
             elif block.language == "python" and block.title is None:
-                run_block(block, namespace)
+                with as_before(place):  # a session of its own, as each command is a process
+                    run_block(block, {"__name__": "printed"})
     runs = [path.parent for path in place.glob("outputs/*/run/agent/agent.json")]
     assert len(runs) == 1, "a tutorial ends with a controller"
     for report in place.glob("outputs/*/report"):
