@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import json
 import re
 import runpy
 import shlex
@@ -18,7 +17,7 @@ from typing import Any
 import pytest
 
 from phihp_torchrl.commands.console import main as phihp
-from phihp_torchrl.config import ConfigError, override_lines
+from phihp_torchrl.config import override_lines
 from phihp_torchrl.worlds import make_world
 from tests.docs.blocks import BLOCKS, SHELLS, Block
 from tests.docs.conftest import TINY, as_before
@@ -67,6 +66,8 @@ def run_line(line: str, place: Path, started: list[subprocess.Popen[bytes]]) -> 
             words.append("steps=400")
         with as_before(place):
             phihp([command, *words, *override_lines(SMALLER[command])])
+            if "aero" in sys.modules:  # a process that ends hangs up
+                sys.modules["aero"].make_env().close()
     elif program == "python" and words[-1] == "&":
         words = [*words[:-1], "speed=0", "seconds=240"]
         started.append(subprocess.Popen([sys.executable, *words], cwd=place))
@@ -173,9 +174,8 @@ def test_a_rig_that_is_gone_is_an_error_and_no_hang(rig):
     process.kill()
     process.wait(timeout=10)
     begun = time.monotonic()
-    with pytest.raises((OSError, ConfigError, ValueError)):
-        for _ in range(3):
-            now = env.step(now.set("action", env.action_spec.zero()))["next"]
+    with pytest.raises((OSError, ValueError)):
+        env.rollout(3, tensordict=now, auto_reset=False)
     assert time.monotonic() - begun < 10.0
 
 
@@ -185,12 +185,3 @@ def test_a_value_that_is_not_printed_is_not_looked_for(place):
         run_block(Block("page.md", 1, "python", None, "1 / 0\n"), {})
     with pytest.raises(AssertionError, match="unknown program"):
         run_line("curl https://example.com", place, [])
-
-
-def test_a_report_becomes_a_task(tmp_path):
-    from phihp_torchrl import get_task
-    from phihp_torchrl.identification import identified_task
-
-    (tmp_path / "identification.json").write_text(json.dumps({"constants": {}}))
-    with pytest.raises(ConfigError, match="report: expected an identification.json"):
-        identified_task(get_task("pendulum"), tmp_path)
