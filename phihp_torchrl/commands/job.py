@@ -42,7 +42,9 @@ def launch(words: Sequence[str], settings: Sequence[str], config_dir: str | None
     if "-m" not in words and "--multirun" not in words:
         compose_yaml(settings, config_dir)  # whose errors name the key
     publish_offers(*([] if config_dir is None else [config_dir]))
-    sys.argv = [sys.argv[0], *open_mappings(words)]
+    # Hydra's parser takes assignments in one place alone, and not on both sides of a flag.
+    flags = [word for word in words if word not in set(settings)]
+    sys.argv = [sys.argv[0], *flags, *open_mappings(settings)]
     hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="train")(job)()
 
 

@@ -95,7 +95,10 @@ def fit(
     start = time.perf_counter()
     if config.scaled:
         loss.set_scales(train)
-    if isinstance(loss.dynamics.residual, EnsembleResidual):
+    # A prior whose constants are all fixed has nothing to fit.
+    if not any(parameter.numel() for parameter in loss.dynamics.parameters()):
+        steps = 0
+    elif isinstance(loss.dynamics.residual, EnsembleResidual):
         steps = _fit_members(loss, loss.dynamics.residual, train, held_out, config, generator)
     else:
         steps = _METHODS[config.method](loss, train, held_out, config, generator)

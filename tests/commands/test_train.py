@@ -36,6 +36,13 @@ def test_a_sweep_is_a_run_for_each_value(phihp: Command, place: Path) -> None:
     assert all((run / "metrics.csv").is_file() for run in runs)
 
 
+def test_flags_may_stand_between_settings(phihp: Command, place: Path) -> None:
+    (place / "mine").mkdir()
+    phihp("train", *MODEL, "--config-dir", "mine", "run_dir=run", "seed=3")
+    kept = yaml.safe_load((place / "run" / "config.yaml").read_text())
+    assert kept["seed"] == 3
+
+
 def test_a_stopped_run_says_how_to_go_on(
     phihp: Command, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

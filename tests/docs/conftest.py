@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -44,6 +45,23 @@ TINY = {
 """What makes a printed run short; it goes over what the example says."""
 
 
+@contextmanager
+def as_before(place: Path) -> Iterator[None]:
+    """Afterwards nothing is registered or imported from ``place``, as after a process."""
+    tables = [_OFFERED, _PLANTS]
+    tables += [r._entries for r in (METHODS, AGENT_KINDS, PLANNERS, _TASKS, PHASES, WORLDS)]
+    before = [dict(table) for table in tables]
+    try:
+        yield
+    finally:
+        for table, entries in zip(tables, before, strict=True):
+            table.clear()
+            table.update(entries)
+        for name, module in list(sys.modules.items()):
+            if str(getattr(module, "__file__", None) or "").startswith(str(place)):
+                del sys.modules[name]
+
+
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A working directory with every file that a page prints and with the trained agents."""
@@ -52,16 +70,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     for directory in {tmp_path, *(path.parent for path in tmp_path.glob("*/*.py"))}:
         monkeypatch.syspath_prepend(directory)
-    tables = [_OFFERED, _PLANTS]
-    tables += [r._entries for r in (METHODS, AGENT_KINDS, PLANNERS, _TASKS, PHASES, WORLDS)]
-    before = [dict(table) for table in tables]
-    yield tmp_path
-    for table, entries in zip(tables, before, strict=True):
-        table.clear()
-        table.update(entries)
-    for name, module in list(sys.modules.items()):
-        if str(getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
-            del sys.modules[name]
+    with as_before(tmp_path):
+        yield tmp_path
 
 
 @pytest.fixture

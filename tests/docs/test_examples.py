@@ -26,6 +26,8 @@ def python_pages() -> list[Any]:
     """Pages with Python to run, those with a slow block marked so."""
     pages = []
     for page, blocks in BLOCKS.items():
+        if page.startswith("docs/tutorials/"):
+            continue  # which have commands between their blocks, and a test of their own
         python = [block for block in blocks if block.language == "python" and not block.title]
         if python:
             slow = any(block.mark == "slow" for block in python)

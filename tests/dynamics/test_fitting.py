@@ -356,3 +356,15 @@ def test_non_finite_transitions(which, key, value):
 def test_config_errors_name_the_key(name, value):
     with pytest.raises(ConfigError, match=f"^{name}: expected "):
         FitConfig(**{name: value})
+
+
+@pytest.mark.parametrize("method", ["levenberg_marquardt", "adam"])
+def test_a_prior_of_fixed_constants_is_judged_and_not_fitted(method):
+    class Known(Pendulum):
+        default_constants = {n: Constant(v, fixed=True) for n, v in Pendulum().constants.items()}
+
+    task = replace(PENDULUM, system=Known())
+    loss, data = DynamicsLoss(HybridDynamics.pure_prior(task)), transitions(SMOOTH, 64)
+    report = fit(loss, data, data, FitConfig(method=method))
+    assert report.steps == 0
+    assert report.held_out_error < 1e-6
