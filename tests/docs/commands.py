@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from importlib.util import find_spec
+from pathlib import Path
 
 from phihp_torchrl.commands.console import COMMANDS
 from phihp_torchrl.commands.evaluate import PlayConfig
@@ -78,6 +79,8 @@ def _check_identify(words: list[str]) -> None:
 
 def _check_script(script: str, words: list[str]) -> None:
     path = ROOT / script
+    if "/" not in script:  # a file that a page prints
+        path = Path(script)
     assert path.is_file(), f"there is no {script}"
     source = path.read_text()
     for word in words:
