@@ -63,7 +63,7 @@ def test_no_other_solver_is_tried_where_the_cheapest_is_good():
     ("errors", "index"), [([1.0, 0.9, 0.8], 0), ([1.0, 0.3, 0.2], 1), ([1.0, 0.9, 0.1], 2)]
 )
 def test_a_finer_solver_must_halve_the_error(errors, index):
-    trials = [SolverTrial(RK4(), FitReport(e, e, 1, 0.0)) for e in errors]
+    trials = [SolverTrial(RK4(), FitReport(0.0, 0.0, 1, 0.0), e) for e in errors]
     assert choose(trials) == index
 
 
