@@ -114,7 +114,8 @@ def estimate_velocities(
     Examples:
         >>> from phihp_torchrl import get_task
         >>> time = 0.05 * torch.arange(200, dtype=torch.float64)
-        >>> noise = 0.001 * torch.randn(200, dtype=torch.float64)
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> noise = 0.001 * torch.randn(200, generator=generator, dtype=torch.float64)
         >>> state = torch.stack([time.sin() + noise, torch.full_like(time, torch.nan)], -1)
         >>> log = Recording(time, state, torch.zeros(200, 1))
         >>> estimate = estimate_velocities(log, get_task("pendulum"))

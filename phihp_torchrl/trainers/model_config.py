@@ -117,13 +117,17 @@ class ModelConfig:
                 "constants_error",
                 f"expected a relative error in [0, 1), got {self.constants_error}.",
             )
-        chooses = self.integrator != AUTO and not has_substeps(self.integrator)
-        if self.kind != "oracle" and self.fit.method != "adam" and chooses:
+        if self.kind != "oracle" and self.fit.method != "adam" and not self.has_fixed_steps:
             raise ConfigError(
                 "fit.method",
                 f"expected 'adam' for a model that is integrated by {self.integrator}, which "
                 f"chooses its own steps, got {self.fit.method!r}.",
             )
+
+    @property
+    def has_fixed_steps(self) -> bool:
+        """Whether the model's integrator takes steps of fixed length, as least squares need."""
+        return self.integrator == AUTO or has_substeps(self.integrator)
 
     @property
     def period(self) -> int:

@@ -80,7 +80,8 @@ class PolicyTrainer(TD3Trainer):
         ConfigError: for constants to draw without their covariance, or that are not learned.
 
     Examples:
-        >>> from phihp_torchrl import get_task
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> from phihp_torchrl.agents import RefitConfig
         >>> task = get_task("pendulum")
         >>> config = PolicyConfig(
         ...     updates=4,

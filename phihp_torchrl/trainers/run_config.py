@@ -22,7 +22,6 @@ from phihp_torchrl.config import (
     to_mapping,
 )
 from phihp_torchrl.evaluation import check_training_seed
-from phihp_torchrl.integrators import has_substeps
 from phihp_torchrl.planners import PLANNERS, CEMConfig, SearchConfig
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.trainers.loggers import LoggerConfig
@@ -345,7 +344,7 @@ def _check_drawing(config: RunConfig, task: Task) -> None:
             f"expected false for a model of kind {model.kind!r} of a system that has "
             f"{len(learned)} constants to learn: there are none to draw.",
         )
-    if not has_substeps(model.integrator) and config.section("policy").constants_std is None:
+    if not model.has_fixed_steps and config.section("policy").constants_std is None:
         raise ConfigError(
             "policy.constants_std",
             f"expected a number with draw_constants=true and model.integrator={model.integrator}, "
