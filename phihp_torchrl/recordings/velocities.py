@@ -119,7 +119,7 @@ def estimate_velocities(
         >>> state = torch.stack([time.sin() + noise, torch.full_like(time, torch.nan)], -1)
         >>> log = Recording(time, state, torch.zeros(200, 1))
         >>> estimate = estimate_velocities(log, get_task("pendulum"))
-        >>> error = estimate.recordings[0].state[:, 1] - time.cos()
+        >>> error = (estimate.recordings[0].state[:, 1] - time.cos())[10:-10]  # not at the ends
         >>> bool(error.abs().max() < 0.02), 0.0005 < estimate.found["theta"].noise < 0.002
         (True, True)
     """
