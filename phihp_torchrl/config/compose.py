@@ -34,7 +34,7 @@ PLACES = ("run_dir", "resume")
 _GROUPS = ("preset", "task", "method", "budget", "logger", "world", "planner")
 _NAMES = ("task", "preset", "method")
 # Settings that are mappings with names of a user's choice, or that change something by name.
-_MAPPINGS = ("actuator", r"world\.(?:actuator|friction|constants|noise)")
+_MAPPINGS = ("actuator", r"world\.(?:actuator|friction|constants|noise|columns)")
 _FIRST_PLANNER = "cem"  # the kind of planner that a layer's numbers are for if it names none
 
 
@@ -182,7 +182,7 @@ def open_mappings(words: Sequence[str]) -> list[str]:
         >>> open_mappings(["world.friction={joint:0.1}", "actuator.lag=0.1", "seed=0"])
         ['++world.friction={joint:0.1}', '++actuator.lag=0.1', 'seed=0']
     """
-    adds = re.compile(rf"[\w.]+=\s*\{{|({'|'.join(_MAPPINGS)})\.\w+=")
+    adds = re.compile(rf"[\w.]+=\s*\{{|({'|'.join(_MAPPINGS)})\.[\w.]+=")
     return [f"++{word}" if adds.match(word) else word for word in words]
 
 

@@ -30,6 +30,7 @@ _EXPLAINED = 0.1
 _WHITE = 0.3
 _OVER = 2.0
 _EXACT = 1e-5  # residuals below this share of the motion are those of the integrator
+_MISFIT = 3.0  # ratio of the error of predictions to the noise at which intervals are doubted
 
 
 def of_constants(constants: Mapping[str, Estimate]) -> list[Finding]:
@@ -155,7 +156,16 @@ def of_errors(errors: Mapping[str, HorizonError]) -> list[Finding]:
             )
         ]
     steps = max(errors, key=int)
-    return [
+    ratios = [error.floor_ratio for error in errors[steps].states.values()]
+    doubt = [
+        Finding(
+            "incomplete",
+            "The equations do not describe the recordings to the noise, so constants may be wrong "
+            "by more than their intervals say: those hold for complete equations.",
+            "Add what the residuals point to, and see whether the constants move.",
+        )
+    ]
+    return (doubt if max(ratios, default=0.0) > _MISFIT else []) + [
         Finding(
             "error",
             f"{name}: {steps} steps ahead the error is {error.rmse:.3g}, {error.floor_ratio:.1f} "

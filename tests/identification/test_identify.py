@@ -11,6 +11,8 @@ import torch
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.identification import Identification, IdentifyConfig, identify
+from phihp_torchrl.identification.diagnostics import of_errors
+from phihp_torchrl.identification.parts import HorizonError, StateError
 from phihp_torchrl.integrators import make_integrator
 from phihp_torchrl.recordings import Recording
 from phihp_torchrl.tasks import Actuator
@@ -230,3 +232,13 @@ def test_a_rig_that_was_simulated_by_eulers_steps_is_integrated_so() -> None:
     found = identify(make_task(Mass(), step=0.05), [log], IdentifyConfig(**settings))
     assert found.settings["integrator"] == "semi_implicit_euler"
     assert found.constants["stiffness"].estimate == pytest.approx(MASS["stiffness"], rel=1e-3)
+
+
+def test_intervals_of_incomplete_equations_are_doubted():
+    def errors(ratio):
+        theta = StateError(rmse=1.0, share=0.1, floor_ratio=ratio, count=9)
+        return {"20": HorizonError({"theta": theta}, share=0.1, floor_ratio=ratio)}
+
+    assert [f.code for f in of_errors(errors(1.1))] == []
+    assert [f.code for f in of_errors(errors(2.5))] == ["error"]
+    assert [f.code for f in of_errors(errors(9.0))] == ["incomplete", "error"]
