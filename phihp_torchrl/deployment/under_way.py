@@ -47,8 +47,7 @@ class UnderWay:
     def extend(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the tensordict with the observation of the task in place of the system's."""
         shown = tensordict["observation"]
-        state = self.task.system.locate(shown)
-        rest = self.task.split(self.task.at_rest(state))[1]
+        rest = self.task.rest(shown)
         kept = self._registers
         if kept is None or kept.shape != rest.shape or kept.device != rest.device:
             kept = rest
@@ -56,9 +55,7 @@ class UnderWay:
             starts = starts.reshape(*tensordict.batch_size, 1)
             kept = torch.where(expand_as_right(starts, rest), rest, kept)
         self._registers = kept
-        whole = self.task.observe(torch.cat([state, kept], -1))
-        observation = torch.cat([shown, whole[..., shown.shape[-1] :]], -1)
-        return tensordict.copy().set("observation", observation)
+        return tensordict.copy().set("observation", self.task.complete(shown, kept))
 
     def record(self, action: Tensor) -> None:
         """Remember a command ``[*batch, m]`` that :meth:`extend` was asked before."""

@@ -190,8 +190,7 @@ class Task:
         if not self.register_count:
             return self.system.observe(state)
         physical, registers = self.split(state)
-        center, scale = self._register_scales(state)
-        return torch.cat([self.system.observe(physical), (registers - center) / scale], -1)
+        return self.complete(self.system.observe(physical), registers)
 
     def locate(self, observation: Tensor) -> Tensor:
         """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""
@@ -230,15 +229,25 @@ class Task:
         """The state ``[*batch, n]`` of physical components with nothing under way."""
         if not self.register_count:
             return physical
-        assert self.actuator is not None
-        still = torch.zeros_like(physical[..., :1]).expand(*physical.shape[:-1], self.action_dim)
-        return torch.cat([physical, self.actuator.rest(self.clip_action(still))], -1)
+        return torch.cat([physical, self.rest(physical)], -1)
 
     def sample_start(
         self, shape: torch.Size | list[int], generator: torch.Generator | None = None
     ) -> Tensor:
         """Draw states ``[*shape, n]`` in which episodes start, with nothing under way."""
         return self.at_rest(self.reset.sample(shape, generator=generator))
+
+    def complete(self, observation: Tensor, registers: Tensor) -> Tensor:
+        """The task's observation ``[*batch, o]`` from one of the system's and the registers."""
+        center, scale = self._register_scales(observation)
+        return torch.cat([observation, (registers.to(observation.dtype) - center) / scale], -1)
+
+    def rest(self, like: Tensor) -> Tensor:
+        """The registers ``[*batch, r]`` with nothing under way, for a tensor ``[*batch, ...]``."""
+        still = torch.zeros_like(like[..., :1]).expand(*like.shape[:-1], self.action_dim)
+        return (
+            like[..., :0] if self.actuator is None else self.actuator.rest(self.clip_action(still))
+        )
 
     def acting(self, registers: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return what acts on the system during a step, and the registers after it.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right
-from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import Transform
 
@@ -50,7 +49,7 @@ class CommandMemory(Transform):
         shown = tensordict_reset["observation"]
         if shown.shape[-1] == self.task.observation_dim:  # a row whose episode goes on
             return tensordict_reset
-        fresh = self._extend(shown, None)
+        fresh = self.task.complete(shown, self.task.rest(shown))
         mask = tensordict.get("_reset", None)
         if mask is not None and not mask.all():
             fresh = torch.where(expand_as_right(mask, fresh), fresh, tensordict["observation"])
@@ -60,15 +59,7 @@ class CommandMemory(Transform):
         _, before = self.task.split(self.task.locate(tensordict["observation"]))
         _, after = self.task.acting(before, tensordict["action"].to(before.dtype))
         shown = next_tensordict["observation"]
-        return next_tensordict.set("observation", self._extend(shown, after))
-
-    def _extend(self, shown: Tensor, registers: Tensor | None) -> Tensor:
-        """The observation of the task; with nothing under way where registers are ``None``."""
-        state = self.task.system.locate(shown)
-        rest = self.task.at_rest(state)
-        registers = self.task.split(rest)[1] if registers is None else registers
-        whole = self.task.observe(torch.cat([state, registers.to(state.dtype)], -1))
-        return torch.cat([shown, whole[..., shown.shape[-1] :]], -1)
+        return next_tensordict.set("observation", self.task.complete(shown, after))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         spec = observation_spec["observation"]
