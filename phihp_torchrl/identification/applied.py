@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.identification.parts import IDENTIFIED, ActuatorEstimate, Estimate
-from phihp_torchrl.identification.paste import actuator_of
+from phihp_torchrl.identification.parts import ActuatorEstimate, Estimate
 from phihp_torchrl.identification.result import Identification
-from phihp_torchrl.systems import Constant
 from phihp_torchrl.tasks import Task
-
-_INSIDE = 1e-3
-"""How far inside its range a first guess stays, as a share of it: its limits are not allowed."""
 
 
 def identified_task(task: Task, report: str | Path, *, fixed: bool = False) -> Task:
@@ -50,24 +44,10 @@ def identified_task(task: Task, report: str | Path, *, fixed: bool = False) -> T
         (1.2, Actuator(delay_steps=2.0, lag=0.0, slew=None, dead_zone=0.0, gain_low=1.0))
     """
     found = _read(Path(report))
-    ranges, constants = task.system.ranges, {}
-    for name, estimate in found.constants.items():
-        declared = ranges.get(name)
-        if declared is None:
-            known = list(task.system.constants)
-            raise ConfigError("report", f"{report} has the constant {name!r}, expected {known}.")
-        if not declared.fixed:
-            constants[name] = _inside(declared, estimate.estimate)
-    system = task.system.with_constants(constants)
-    if fixed:
-        known = [name for name in constants if found.constants[name].verdict == IDENTIFIED]
-        system.ranges |= {n: replace(system.ranges[n], fixed=True) for n in known}
-    return replace(
-        task,
-        system=system,
-        actuator=actuator_of(task, found) or task.actuator,
-        position_limits={**found.stops, **task.position_limits},
-    )
+    if unknown := sorted(set(found.constants) - set(task.system.ranges)):
+        known = list(task.system.constants)
+        raise ConfigError("report", f"{report} has the constant {unknown[0]!r}, expected {known}.")
+    return found.task(task, fixed=fixed)
 
 
 def _read(path: Path) -> Identification:
@@ -96,10 +76,3 @@ def _read(path: Path) -> Identification:
         data=data,
         stops=stops,
     )
-
-
-def _inside(declared: Constant, value: float) -> float:
-    if not declared.bounded:
-        return value
-    room = _INSIDE * (declared.high - declared.low)
-    return min(max(value, declared.low + room), declared.high - room)

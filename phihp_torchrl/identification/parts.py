@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from phihp_torchrl.systems import Constant
 from phihp_torchrl.tasks import Actuator
 
 IDENTIFIED = "identified"
@@ -198,3 +199,15 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.text} {self.advice}"
+
+
+_INSIDE = 1e-3
+"""How far inside its range a first guess stays, as a share of it: its limits are not allowed."""
+
+
+def inside(declared: Constant, value: float) -> float:
+    """An estimate of a constant as a first guess, inside the range of a bounded one."""
+    if not declared.bounded:
+        return value
+    room = _INSIDE * (declared.high - declared.low)
+    return min(max(value, declared.low + room), declared.high - room)

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
-from phihp_torchrl.identification.parts import FIXED, IDENTIFIED
+from phihp_torchrl.identification.parts import FIXED, IDENTIFIED, inside
 from phihp_torchrl.identification.result import Identification
 from phihp_torchrl.systems import Constant
-from phihp_torchrl.tasks import Actuator, Task
-
-_INSIDE = 1e-3
-"""How far inside its range a first guess stays, as a share of it: its limits are not allowed."""
+from phihp_torchrl.tasks import Task
 
 
 def ready_to_paste(task: Task, found: Identification) -> dict[str, str]:
@@ -42,7 +38,7 @@ def ready_to_paste(task: Task, found: Identification) -> dict[str, str]:
     """
     lines = {f"{type(task.system).__name__}, in Python": "\n".join(_constants(task, found))}
     given: list[str] = []
-    actuator = actuator_of(task, found)
+    actuator = found.actuator_for(task)
     if actuator is not None:
         numbers = {name: _rounded(value) for name, value in actuator.config.items()}
         python = ", ".join(f"{name}={value}" for name, value in numbers.items())
@@ -61,15 +57,6 @@ def ready_to_paste(task: Task, found: Identification) -> dict[str, str]:
     return lines
 
 
-def actuator_of(task: Task, found: Identification) -> Actuator | None:
-    """The fitted actuator with its delay in steps of the task; ``None`` for a perfect one."""
-    actuator, step = found.actuator.actuator, found.data.get("step_s")
-    if actuator is None or not step or abs(step / task.time_step - 1.0) < 0.02:
-        return actuator
-    delay = found.actuator.delay_steps * step / task.time_step
-    return replace(actuator, delay_steps=delay)
-
-
 def _constants(task: Task, found: Identification) -> Iterator[str]:
     yield "default_constants = {"
     for name, c in found.constants.items():
@@ -78,9 +65,7 @@ def _constants(task: Task, found: Identification) -> Iterator[str]:
         if declared.fixed:
             value = f"Constant({value}, fixed=True)"
         elif declared.bounded:
-            room = _INSIDE * (declared.high - declared.low)
-            inside = min(max(c.estimate, declared.low + room), declared.high - room)
-            value = _rounded(inside)
+            value = _rounded(inside(declared, c.estimate))
             value = f"Constant({value}, low={declared.low:g}, high={declared.high:g})"
         known = c.verdict in (IDENTIFIED, FIXED)
         yield f'    "{name}": {value},' + ("" if known else f"  # {c.verdict}")

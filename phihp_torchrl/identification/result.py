@@ -11,7 +11,7 @@ from typing import Any
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.identification.parts import (
-    FIXED,
+    IDENTIFIED,
     ActuatorEstimate,
     Estimate,
     Finding,
@@ -19,9 +19,10 @@ from phihp_torchrl.identification.parts import (
     Region,
     Residuals,
     Rollout,
+    inside,
 )
 from phihp_torchrl.identification.table import lay_out
-from phihp_torchrl.tasks import Task
+from phihp_torchrl.tasks import Actuator, Task
 
 
 @dataclass(frozen=True)
@@ -98,21 +99,41 @@ class Identification:
         path.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
         return path
 
-    def task(self, task: Task) -> Task:
+    def task(self, task: Task, *, fixed: bool = False) -> Task:
         """The task with the fitted constants as first guesses, the fitted actuator, and stops.
+
+        Fixed constants stay, and so do stops that the task has. A delay is counted in steps of the
+        task, which may be others than those of the recordings.
 
         Args:
             task: the task that was identified.
+            fixed: whether constants that are identified are fixed, so that training keeps them.
 
         Raises:
             ConfigError: if its system does not have the constants.
         """
-        if missing := sorted(set(self.constants) - set(task.system.constants)):
+        ranges = task.system.ranges
+        if missing := sorted(set(self.constants) - set(ranges)):
             raise ConfigError("task", f"{task.name} has no constants {missing}.")
-        values = {name: c.estimate for name, c in self.constants.items() if c.verdict != FIXED}
+        free = {name: c for name, c in self.constants.items() if not ranges[name].fixed}
+        values = {name: inside(ranges[name], c.estimate) for name, c in free.items()}
         system = task.system.with_constants(values)
-        limits = {**self.stops, **task.position_limits}
-        return replace(task, system=system, actuator=self.actuator.actuator, position_limits=limits)
+        if fixed:
+            known = [name for name, c in free.items() if c.verdict == IDENTIFIED]
+            system.ranges |= {n: replace(system.ranges[n], fixed=True) for n in known}
+        return replace(
+            task,
+            system=system,
+            actuator=self.actuator_for(task) or task.actuator,
+            position_limits={**self.stops, **task.position_limits},
+        )
+
+    def actuator_for(self, task: Task) -> Actuator | None:
+        """The fitted actuator with its delay in steps of ``task``; ``None`` for a perfect one."""
+        actuator, step = self.actuator.actuator, self.data.get("step_s")
+        if actuator is None or not step or abs(step / task.time_step - 1.0) < 0.02:
+            return actuator
+        return replace(actuator, delay_steps=self.actuator.delay_steps * step / task.time_step)
 
     def table(self) -> str:
         """A page for a console."""
