@@ -78,3 +78,8 @@ class FitConfig:
                     f"expected null with method={self.method!r}, which has a loss of its own, "
                     f"got {self.robust}.",
                 )
+
+    @property
+    def lambda_growth(self) -> float:
+        """Factor of λ per step of least squares: from first to last in half of the steps."""
+        return (self.final_lambda / self.initial_lambda) ** (1.0 / max(1, self.steps // 2))

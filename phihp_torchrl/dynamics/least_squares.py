@@ -40,7 +40,6 @@ def levenberg_marquardt(
     reference, seconds = _timed(loss, held_out), loss.time_step(train)
     theta = system.vector.read()
     damping = 1e-2
-    growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
     loss.lambda_.fill_(config.initial_lambda)
     # The first parameters are a candidate too, because they may come from an earlier, better fit.
     best, best_error = theta, system.prediction_error(theta, reference)
@@ -62,7 +61,7 @@ def levenberg_marquardt(
         final = loss.lambda_.item() >= config.final_lambda
         if final and (stale >= config.patience or not improved):
             break
-        loss.lambda_.mul_(growth).clamp_(max=config.final_lambda)
+        loss.lambda_.mul_(config.lambda_growth).clamp_(max=config.final_lambda)
     system.vector.write(best)
     return steps
 

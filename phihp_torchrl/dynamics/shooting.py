@@ -95,7 +95,6 @@ def multiple_shooting(
     reference = cut_windows(loss, held_out, config.window)
     theta = problem.vector.read()
     starts, checks = windows.states[:, 0].clone(), reference.states[:, 0].clone()
-    growth = (config.final_lambda / config.initial_lambda) ** (1.0 / max(1, config.steps // 2))
     loss.lambda_.fill_(config.initial_lambda)
     sigma = problem.noise(theta, starts, windows)
     damping, stale, steps = 1e-2, 0, 0
@@ -122,7 +121,7 @@ def multiple_shooting(
         final = loss.lambda_.item() >= config.final_lambda
         if final and (stale >= config.patience or not improved):
             break
-        loss.lambda_.mul_(growth).clamp_(max=config.final_lambda)
+        loss.lambda_.mul_(config.lambda_growth).clamp_(max=config.final_lambda)
     problem.vector.write(best)
     return steps
 
