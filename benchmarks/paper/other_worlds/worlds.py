@@ -47,6 +47,7 @@ class OtherWorld:
     others: Mapping[str, Fit] = field(default_factory=dict)
 
 
+_EULER = {"integrator": "semi_implicit_euler"}
 _RK4 = {"integrator": "rk4", "substeps": 2}
 _RAIL = {"x": (-from_dm_control.RAIL, from_dm_control.RAIL)}
 _TEXTBOOK = replace(
@@ -74,7 +75,7 @@ WORLDS = {
         from_dm_control.PENDULUM,
         from_dm_control.pendulum_env,
         repeat=2,
-        model={"substeps": 2},
+        model=_EULER | {"substeps": 2},
         others={"default settings": Fit(from_dm_control.PENDULUM)},
     ),
     "dm_control acrobot": OtherWorld(
@@ -87,12 +88,15 @@ WORLDS = {
     "gymnasium MountainCarContinuous-v0": OtherWorld(
         _CAR,
         from_gymnasium.mountain_car_env,
+        model=_EULER,
         stops={"x": (-1.2, 0.6)},
         others={
             "no stops": Fit(_OPEN_CAR),
             "no stops, robust loss": Fit(_OPEN_CAR, robust=2.0),
         },
     ),
-    "gymnasium Pendulum-v1": OtherWorld(from_gymnasium.PENDULUM_V1, from_gymnasium.pendulum_v1_env),
+    "gymnasium Pendulum-v1": OtherWorld(
+        from_gymnasium.PENDULUM_V1, from_gymnasium.pendulum_v1_env, model=_EULER
+    ),
 }
 """The worlds by name."""

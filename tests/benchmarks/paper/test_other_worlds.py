@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from other_worlds import STEPS, WORLDS, shares
 from phihp_torchrl import HybridDynamics
 from phihp_torchrl.dynamics import DynamicsLoss
+from phihp_torchrl.trainers import ModelConfig
 from phihp_torchrl.worlds import make_world
 
 HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
@@ -21,6 +22,8 @@ CASES = [
     pytest.param(name, marks=[needs_dm_control] if name.startswith("dm_control") else [])
     for name in WORLDS
 ]
+
+
 TRUTH = {
     "dm_control cartpole": {
         "cart_mass": 1.0,
@@ -42,6 +45,11 @@ TRUTH = {
     "gymnasium MountainCarContinuous-v0": {"motor": 0.15, "slope": 0.25},
     "gymnasium Pendulum-v1": {"mass": 1.0, "length": 1.0},
 }
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_what_is_told_of_the_simulator_is_what_a_fit_takes(name):
+    ModelConfig(**WORLDS[name].model)
 
 
 def played(world, policy, steps, seed=100):
