@@ -1,4 +1,4 @@
-"""What tests of the paper's benchmarks share: scripts run as from the command line."""
+"""What tests of the paper's benchmarks share: scripts run as from a command line, quick reports."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from report import write
 
 PAPER = Path(__file__).parents[3] / "benchmarks" / "paper"
 
@@ -27,3 +29,20 @@ def run_script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[...,
         runpy.run_path(path, run_name="__main__")
 
     return run
+
+
+@pytest.fixture
+def drawn() -> None:
+    """Request it to have the pictures of reports drawn; most of a report's time goes there."""
+
+
+@pytest.fixture(autouse=True)
+def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if "drawn" in request.fixturenames:
+        return
+
+    def draw(picture: write.Picture, directory: Path) -> None:
+        for suffix in ("svg", "png"):
+            (directory / f"{picture.name}.{suffix}").write_text("not drawn")
+
+    monkeypatch.setattr(write, "_draw", draw)

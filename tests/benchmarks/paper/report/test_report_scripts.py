@@ -12,6 +12,7 @@ from grid_cells import ROOT
 from kept_runs import make_run
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_script_makes_the_report_and_logs_its_figures(
     run_script: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from kept_runs import make, make_run, table, text
+from matplotlib.figure import Figure
 
 from report import (
     NOT_RUN,
@@ -19,8 +20,11 @@ from report import (
     write_trials,
 )
 from report.overview import END, START, fill_page, overview
+from report.sections import Picture, Section
+from report.write import write_report
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_whole_report(tmp_path: Path) -> None:
     pytest.importorskip("rliable")
     runs = tmp_path / "runs"
@@ -64,15 +68,31 @@ def test_the_whole_report(tmp_path: Path) -> None:
     assert "| pendulum | 2 | 1000 | −185.0 ± 0.0 | −186.5 ± 0.0 |" in filled
     assert filled.endswith("\n\nThe end.\n")
 
-    # The same runs make the same files.
-    def files() -> dict[str, bytes]:
-        kept = sorted(p for p in (tmp_path / "report").rglob("*") if p.is_file())
-        return {str(path): path.read_bytes() for path in kept}
 
-    before = files()
-    shutil.rmtree(tmp_path / "report")
-    make(tmp_path)
-    assert files() == before
+def test_the_same_runs_make_the_same_files(tmp_path: Path) -> None:
+    make_run(tmp_path / "runs")
+    made = []
+    for _ in range(2):
+        make(tmp_path)
+        kept = sorted(p for p in (tmp_path / "report").rglob("*") if p.is_file())
+        made.append({path.name: path.read_bytes() for path in kept})
+        shutil.rmtree(tmp_path / "report")
+    assert made[0] == made[1]
+
+
+@pytest.mark.usefixtures("drawn")
+def test_the_same_picture_makes_the_same_files(tmp_path: Path) -> None:
+    made = []
+    for _ in range(2):
+        figure = Figure(layout="constrained")
+        figure.subplots().plot([0, 1], [1, 2], label="a line")
+        section = Section("Title", pictures=[Picture("a_picture", figure, "What it shows")])
+        write_report(tmp_path, "Report", "", [section])
+        figures = sorted((tmp_path / "figures").iterdir())
+        assert [path.name for path in figures] == ["a_picture.png", "a_picture.svg"]
+        made.append([path.read_bytes() for path in figures])
+        shutil.rmtree(tmp_path)
+    assert made[0] == made[1]
 
 
 def test_without_the_extra_the_rest_is_made(
