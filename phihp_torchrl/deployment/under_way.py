@@ -1,4 +1,4 @@
-"""The memory of an acting agent: the commands that are under way in the task's actuator."""
+"""The memory of an acting agent: the commands under way, and the last one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class UnderWay:
     """Completes observations of the system by what the agent commanded before.
 
     Args:
-        task: the task, with an actuator.
+        task: the task, with registers.
 
     Examples:
         >>> from dataclasses import replace
@@ -24,7 +24,8 @@ class UnderWay:
         >>> memory = UnderWay(replace(get_task("pendulum"), actuator=Actuator(delay_steps=1.0)))
         >>> shown = TensorDict(observation=torch.tensor([1.0, 0.0, 0.0]))
         >>> _ = memory.extend(shown)
-        >>> memory.record(torch.tensor([2.0]))
+        >>> memory.record(torch.tensor([2.5]))
+        tensor([2.])
         >>> memory.extend(shown)["observation"]
         tensor([1., 0., 0., 1.])
     """
@@ -57,7 +58,13 @@ class UnderWay:
         self._registers = kept
         return tensordict.copy().set("observation", self.task.complete(shown, kept))
 
-    def record(self, action: Tensor) -> None:
-        """Remember a command ``[*batch, m]`` that :meth:`extend` was asked before."""
+    def record(self, action: Tensor) -> Tensor:
+        """Remember the action ``[*batch, m]`` of a step for which :meth:`extend` was asked.
+
+        Returns:
+            The command, which is the action within its bounds and its rate.
+        """
         assert self._registers is not None
-        self._registers = self.task.acting(self._registers, action)[1]
+        command = self.task.command(self._registers, action)
+        self._registers = self.task.acting(self._registers, command)[1]
+        return command

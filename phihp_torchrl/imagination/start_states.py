@@ -65,7 +65,7 @@ class BoxStates:
 class TaskStates:
     """Start states of a task whose physical components come from another sampler.
 
-    Behind them stand the registers of the task's actuator, if it has one.
+    Behind them stand the registers that the task adds, such as commands under way.
 
     Args:
         task: the task.
@@ -94,14 +94,11 @@ class TaskStates:
         device: torch.device | str | None = None,
     ) -> Tensor:
         states = self.physical.sample(shape, generator, device)
-        actuator, bounds = self.task.actuator, self.task.bounds
-        if actuator is None:
+        if not self.task.register_count:
             return states
         if not self.under_way:
             return self.task.at_rest(states)
-        size = [*shape, actuator.places(self.task.action_dim), self.task.action_dim]
-        unit = torch.rand(size, generator=generator, device=_draw_device(generator)).mul(2).sub(1)
-        registers = actuator.random(bounds.to(unit.device).from_unit(unit))
+        registers = self.task.random_registers(shape, generator)
         return torch.cat([states, registers.to(states)], -1)
 
 

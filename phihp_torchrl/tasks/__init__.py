@@ -7,6 +7,9 @@ from phihp_torchrl.tasks.actuator import Actuator
 from phihp_torchrl.tasks.base import RewardFn, Step, Task, TerminatedFn, Transition
 from phihp_torchrl.tasks.bounds import ActionBounds
 from phihp_torchrl.tasks.box import Box
+from phihp_torchrl.tasks.last_action import LastAction
+from phihp_torchrl.tasks.numbers import Numbers
+from phihp_torchrl.tasks.registers import Part, Registers
 from phihp_torchrl.tasks.registry import find_task, get_task, list_tasks, register_task
 
 __all__ = [

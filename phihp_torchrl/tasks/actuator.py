@@ -10,10 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError
-
-Numbers = float | tuple[float, ...]
-"""One number for every action, or one number each."""
+from phihp_torchrl.tasks.numbers import Numbers, check_each, one_each, read_numbers
+from phihp_torchrl.tasks.registers import Seconds, follow
 
 
 @dataclass(frozen=True)
@@ -64,16 +62,8 @@ class Actuator:
             value = getattr(self, f.name)
             if f.name == "slew" and value is None:
                 continue
-            listed = isinstance(value, (tuple, list))
-            numbers = tuple(value) if listed else (value,)
             positive = f.name in ("slew", "gain_low")
-            for number in numbers:
-                known = isinstance(number, (int, float)) and math.isfinite(number)
-                if not known or number < 0 or (positive and number == 0):
-                    expected = "above 0" if positive else "of at least 0"
-                    raise ConfigError(f.name, f"expected numbers {expected}, got {value!r}.")
-            kept = tuple(map(float, numbers))
-            object.__setattr__(self, f.name, kept if listed else kept[0])
+            object.__setattr__(self, f.name, read_numbers(f.name, value, positive=positive))
 
     def check(self, actions: Sequence[str]) -> None:
         """Refuse numbers that are not one for all actions or one for each.
@@ -82,12 +72,7 @@ class Actuator:
             ConfigError: naming the field and the actions.
         """
         for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, tuple) and len(value) != len(actions):
-                raise ConfigError(
-                    f"actuator.{f.name}",
-                    f"expected one number, or one for each of {tuple(actions)}, got {value}.",
-                )
+            check_each(f"actuator.{f.name}", getattr(self, f.name), actions)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -95,8 +80,7 @@ class Actuator:
         return {f.name: v for f in fields(self) if (v := getattr(self, f.name)) != f.default}
 
     def _each(self, name: str, count: int) -> tuple[float, ...]:
-        value = getattr(self, name)
-        return value if isinstance(value, tuple) else (value,) * count
+        return one_each(getattr(self, name), count)
 
     def _sizes(self, count: int) -> tuple[int, list[int], list[int]]:
         """Rows of the queue, and the actions that slew and that lag."""
@@ -122,14 +106,15 @@ class Actuator:
         return torch.cat([*([command] * depth), value[..., slewing], value[..., lagging]], -1)
 
     def random(self, commands: Tensor) -> Tensor:
-        """Registers made of commands ``[*batch, k, m]`` drawn for each place, ``k`` places.
+        """Registers after random commands ``[*batch, k, m]``, the newest last.
 
-        There are :meth:`places` of them.
+        The values that slew and lag are those of the command before the ones that wait, so there
+        must be :meth:`places` commands.
         """
-        count = commands.shape[-1]
-        depth, slewing, lagging = self._sizes(count)
-        value = self._shape(commands[..., -1, :])
-        queue = commands[..., :depth, :].flatten(-2)
+        depth, slewing, lagging = self._sizes(commands.shape[-1])
+        places = commands.shape[-2]
+        value = self._shape(commands[..., places - depth - 1, :])
+        queue = commands[..., places - depth :, :].flatten(-2)
         return torch.cat([queue, value[..., slewing], value[..., lagging]], -1)
 
     def places(self, count: int) -> int:
@@ -142,9 +127,7 @@ class Actuator:
         parts = [*range(len(center))] * depth + slewing + lagging
         return center[parts], scale[parts]
 
-    def step(
-        self, registers: Tensor, command: Tensor, time_step: float | Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def step(self, registers: Tensor, command: Tensor, time_step: Seconds) -> tuple[Tensor, Tensor]:
         """Advance the registers by one step.
 
         Args:
@@ -183,7 +166,7 @@ class Actuator:
         following = [after, *(x.unsqueeze(-1) for x in [*slewed, *last])]
         return torch.stack(acting, -1), torch.cat(following, -1)
 
-    def along(self, commands: Tensor, intervals: float | Tensor) -> tuple[Tensor, Tensor]:
+    def along(self, commands: Tensor, intervals: Seconds) -> tuple[Tensor, Tensor]:
         """Follow the commands of an episode, which starts with nothing under way.
 
         Args:
@@ -193,14 +176,7 @@ class Actuator:
         Returns:
             The mean action over each step, ``[T, m]``, and the registers before it, ``[T, r]``.
         """
-        seconds = torch.as_tensor(intervals, dtype=commands.dtype).expand(len(commands))
-        registers = self.rest(torch.zeros_like(commands[0]))
-        acting, before = [], []
-        for command, duration in zip(commands, seconds, strict=True):
-            before.append(registers)
-            action, registers = self.step(registers, command, duration)
-            acting.append(action)
-        return torch.stack(acting), torch.stack(before)
+        return follow(self.step, self.rest(torch.zeros_like(commands[0])), commands, intervals)
 
     def _segments(self, i: int, count: int, waited: list[Tensor]) -> list[tuple[float, Tensor]]:
         """The shares of a step, in order, and the shaped command that arrives during each."""
@@ -223,9 +199,7 @@ class Actuator:
         return torch.stack(columns, -1)
 
 
-def _slew(
-    value: Tensor, target: Tensor, rate: float, seconds: float | Tensor
-) -> tuple[Tensor, Tensor]:
+def _slew(value: Tensor, target: Tensor, rate: float, seconds: Seconds) -> tuple[Tensor, Tensor]:
     """Mean and last value of a value that moves to ``target`` at ``rate`` for ``seconds``."""
     gap = target - value
     reach = rate * seconds
@@ -236,9 +210,7 @@ def _slew(
     return mean, last
 
 
-def _lag(
-    value: Tensor, target: Tensor, constant: float, seconds: float | Tensor
-) -> tuple[Tensor, Tensor]:
+def _lag(value: Tensor, target: Tensor, constant: float, seconds: Seconds) -> tuple[Tensor, Tensor]:
     """Mean and last value of the lag ``constant * y' = target - y`` after ``seconds``."""
     ratio = torch.as_tensor(seconds, dtype=value.dtype, device=value.device) / constant
     gap = value - target

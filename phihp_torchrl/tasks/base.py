@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_count, check_positive, from_mapping
+from phihp_torchrl.config import (
+    ConfigError,
+    check_count,
+    check_not_negative,
+    check_positive,
+    from_mapping,
+)
 from phihp_torchrl.integrators import StateLayout
 from phihp_torchrl.systems import System
 from phihp_torchrl.tasks.actuator import Actuator
-from phihp_torchrl.tasks.bounds import ActionBounds
+from phihp_torchrl.tasks.actuator_part import ActuatorPart
+from phihp_torchrl.tasks.bounds import ActionBounds, read_limits
 from phihp_torchrl.tasks.box import Box
+from phihp_torchrl.tasks.last_action import LastAction
+from phihp_torchrl.tasks.numbers import Numbers, check_each, read_numbers
+from phihp_torchrl.tasks.registers import Part, Registers
 
 RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
 """``state [*batch, n], action [*batch, m], next_state [*batch, n] -> reward [*batch]``."""
@@ -78,6 +87,13 @@ class Task:
         actuator: what happens to a command before it acts, such as dead time and lag. Commands that
             are under way then belong to the state, as registers behind the physical components;
             reward, end and dynamics see the physical components alone.
+        action_rate_limit: largest rate of each action in its units per second: one number, or one
+            for each; ``None`` for none. Every command is brought within it, from the last one on,
+            which then belongs to the state.
+        action_rate_cost: price c of a change of the action from step to step:
+            ``c * sum(((a_t - a_{t-1}) / half_range) ** 2)``. It is taken from the reward where the
+            task is imagined, and never in a world (:meth:`unpriced`). The last action then belongs
+            to the state, with a price of 0 too; ``None`` for neither.
 
     Raises:
         ConfigError: for a field whose length or range does not fit the system; the message names
@@ -110,9 +126,13 @@ class Task:
     exploration_reward: RewardFn | None = None
     action_low: tuple[float, ...] | None = None
     actuator: Actuator | None = None
+    action_rate_limit: Numbers | None = None
+    action_rate_cost: float | None = None
 
     layout: StateLayout = field(init=False, repr=False, compare=False)
     """Positions, velocities and their limits, for integrators."""
+    registers: Registers = field(init=False, repr=False, compare=False)
+    """What the task adds to the physical state."""
 
     def __post_init__(self) -> None:
         self._set_bounds()
@@ -128,42 +148,39 @@ class Task:
                 )
         if self.actuator is not None:
             self.actuator.check(self.system.action_names)
+        if self.action_rate_limit is not None:
+            limit = read_numbers("action_rate_limit", self.action_rate_limit, positive=True)
+            check_each("action_rate_limit", limit, self.system.action_names)
+            object.__setattr__(self, "action_rate_limit", limit)
+        if self.action_rate_cost is not None:
+            check_not_negative(self, "action_rate_cost")
         object.__setattr__(self, "velocity_limits", dict(self.velocity_limits))
         object.__setattr__(self, "position_limits", dict(self.position_limits))
         layout = self.system.layout(self.velocity_limits, self.position_limits, self.restitution)
         object.__setattr__(self, "layout", layout)
+        object.__setattr__(self, "registers", Registers(self.parts()))
 
     def _set_bounds(self) -> None:
-        names = self.system.action_names
-        for name in ("action_high", "action_low"):
-            given = getattr(self, name)
-            if given is None:
-                continue
-            if len(given) != len(names):
-                raise ConfigError(name, f"expected {len(names)} values for {names}, got {given}.")
-            if not all(math.isfinite(value) for value in given):
-                raise ConfigError(name, f"expected finite bounds, got {given}.")
-            object.__setattr__(self, name, tuple(float(value) for value in given))
-        if self.action_low is None:
-            if not all(high > 0 for high in self.action_high):
-                raise ConfigError(
-                    "action_high",
-                    f"expected positive bounds where action_low is not given, "
-                    f"got {self.action_high}.",
-                )
-            object.__setattr__(self, "action_low", tuple(-high for high in self.action_high))
-        pairs = zip(self.action_low or (), self.action_high, strict=True)
-        if not all(low < high for low, high in pairs):
-            raise ConfigError(
-                "action_low", f"expected values below {self.action_high}, got {self.action_low}."
-            )
+        low, high = read_limits(self.system.action_names, self.action_low, self.action_high)
+        object.__setattr__(self, "action_low", low)
+        object.__setattr__(self, "action_high", high)
+
+    def parts(self) -> list[Part]:
+        """Make the parts that the task adds to the physical state; the first acts on the system."""
+        bounds, parts = self.bounds, list[Part]()
+        if self.actuator is not None:
+            parts.append(ActuatorPart(self.actuator, bounds))
+        limit, cost = self.action_rate_limit, self.action_rate_cost
+        if limit is not None or cost is not None:
+            parts.append(LastAction(bounds, rate_limit=limit, cost=cost or 0.0))
+        return parts
 
     # Sizes and maps of states, observations and actions, for everything that uses a task.
 
     @property
     def register_count(self) -> int:
-        """Number of registers, ``r``: what is under way between commands and their effect."""
-        return 0 if self.actuator is None else self.actuator.registers(self.action_dim)
+        """Number of registers, ``r``: of all that the task adds to the physical state."""
+        return self.registers.size
 
     @property
     def state_dim(self) -> int:
@@ -197,17 +214,11 @@ class Task:
         if not self.register_count:
             return self.system.locate(observation)
         size = self.system.observation_dim
-        center, scale = self._register_scales(observation)
+        center, scale = self.registers.scales(observation)
         registers = center + scale * observation[..., size:]
         return torch.cat([self.system.locate(observation[..., :size]), registers], -1)
 
-    def _register_scales(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        assert self.actuator is not None
-        bounds = self.bounds
-        scales = self.actuator.scales(bounds.center.to(like), bounds.scale.to(like))
-        return scales[0], scales[1]
-
-    # The registers of a task with an actuator; without one, states are physical as they are.
+    # The registers of a task that adds some; without them, states are physical as they are.
 
     def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Split a state ``[*batch, n]`` into its physical components and its registers."""
@@ -239,27 +250,43 @@ class Task:
 
     def complete(self, observation: Tensor, registers: Tensor) -> Tensor:
         """The task's observation ``[*batch, o]`` from one of the system's and the registers."""
-        center, scale = self._register_scales(observation)
+        center, scale = self.registers.scales(observation)
         return torch.cat([observation, (registers.to(observation.dtype) - center) / scale], -1)
 
     def rest(self, like: Tensor) -> Tensor:
         """The registers ``[*batch, r]`` with nothing under way, for a tensor ``[*batch, ...]``."""
         still = torch.zeros_like(like[..., :1]).expand(*like.shape[:-1], self.action_dim)
-        return (
-            like[..., :0] if self.actuator is None else self.actuator.rest(self.clip_action(still))
-        )
+        return self.registers.rest(self.clip_action(still))
+
+    def random_registers(
+        self, shape: Sequence[int], generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Draw registers ``[*shape, r]`` as in the middle of an episode, on the generator's device.
+
+        The commands before are uniform in their bounds.
+        """
+        device = torch.device("cpu") if generator is None else generator.device
+        size = [*shape, max(self.registers.past, 1), self.action_dim]
+        unit = torch.rand(size, generator=generator, device=device).mul(2).sub(1)
+        return self.registers.random(self.bounds.to(device).from_unit(unit), generator)
+
+    def command(self, registers: Tensor, action: Tensor) -> Tensor:
+        """The command that is given for an action: in its bounds, and within its rate.
+
+        Args:
+            registers: the registers before the step, ``[*batch, r]``.
+            action: the action of the step, ``[*batch, m]``.
+        """
+        return self.registers.command(registers, self.clip_action(action), self.time_step)
 
     def acting(self, registers: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return what acts on the system during a step, and the registers after it.
 
         Args:
             registers: the registers before the step, ``[*batch, r]``.
-            action: the command of the step, ``[*batch, m]``; it is clipped to its bounds.
+            action: the action of the step, ``[*batch, m]``; :meth:`command` is made of it.
         """
-        action = self.clip_action(action)
-        if self.actuator is None:
-            return action, registers
-        return self.actuator.step(registers, action, self.time_step)
+        return self.registers.step(registers, self.command(registers, action), self.time_step)
 
     def difference(self, state: Tensor, other: Tensor) -> Tensor:
         """``state - other``, with differences of angles in [-pi, pi); registers may be left out."""
@@ -270,26 +297,46 @@ class Task:
     def transition(self, step: Step, state: Tensor, action: Tensor) -> Transition:
         """Take one step of the task, in which ``step`` (of a world or a model) moves the state.
 
-        This is the only place where an action is clipped, what is under way moves on, the state is
-        moved, the reward is computed and the termination is decided.
+        This is the only place where an action becomes a command, what is under way moves on, the
+        state is moved, the reward and its prices are computed and the termination is decided.
 
         Args:
             step: ``(physical state, action) -> next physical state``.
             state: the state before the step, ``[*batch, n]``.
-            action: the action, in physical units, ``[*batch, m]``; it is clipped to its bounds.
+            action: the action, in physical units, ``[*batch, m]``; see :meth:`command`.
 
         Returns:
-            The next state, the reward and whether the episode has terminated.
+            The next state, the reward less the prices of :meth:`price`, and whether the episode has
+            terminated.
         """
-        action = self.clip_action(action)
-        if self.actuator is None:
+        before, registers = self.split(state)
+        action = self.command(registers, action)
+        if not self.register_count:
             next_state = moved = step(state, action)
         else:
-            state, registers = self.split(state)
-            acting, registers = self.actuator.step(registers, action, self.time_step)
-            moved = step(state, acting)
-            next_state = torch.cat([moved, registers], -1)
-        return Transition(next_state, self.reward(state, action, moved), self.is_terminated(moved))
+            acting, after = self.registers.step(registers, action, self.time_step)
+            moved = step(before, acting)
+            next_state = torch.cat([moved, after], -1)
+        reward = self.reward(before, action, moved)
+        if (price := self.registers.price(registers, action)) is not None:
+            reward = reward - price
+        return Transition(next_state, reward, self.is_terminated(moved))
+
+    def price(self, state: Tensor, action: Tensor) -> Tensor | None:
+        """What a step costs where the task is imagined, ``[*batch]``; ``None`` for nothing.
+
+        A world gives rewards without prices, so whoever learns from its steps subtracts them.
+
+        Args:
+            state: the state before the step, ``[*batch, n]``.
+            action: the action of the step, ``[*batch, m]``.
+        """
+        _, registers = self.split(state)
+        return self.registers.price(registers, self.command(registers, action))
+
+    def unpriced(self) -> Task:
+        """Return the task as a world plays it: with the same state, and rewards without prices."""
+        return replace(self, action_rate_cost=0.0) if self.action_rate_cost else self
 
     def clip_action(self, action: Tensor) -> Tensor:
         """Clip an action ``[*batch, m]`` to its bounds."""

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+from phihp_torchrl.config import ConfigError
+
+Limits = tuple[float, ...]
 
 
 class ActionBounds(NamedTuple):
@@ -58,3 +63,39 @@ class ActionBounds(NamedTuple):
     def to(self, device: torch.device | str) -> ActionBounds:
         """Return the same bounds on another device."""
         return ActionBounds(*(part.to(device) for part in self))
+
+
+def read_limits(
+    names: Sequence[str], low: Sequence[float] | None, high: Sequence[float]
+) -> tuple[Limits, Limits]:
+    """Return the lower and the upper bound of each action.
+
+    Args:
+        names: names of the actions.
+        low: lower bounds; ``None`` for the negative of the upper ones.
+        high: upper bounds.
+
+    Raises:
+        ConfigError: for bounds that are not finite, not in order, or not one for each action.
+
+    Examples:
+        >>> read_limits(["torque"], None, [2])
+        ((-2.0,), (2.0,))
+    """
+    for key, given in (("action_high", high), ("action_low", low)):
+        if given is None:
+            continue
+        if len(given) != len(names):
+            raise ConfigError(key, f"expected {len(names)} values for {names}, got {given}.")
+        if not all(math.isfinite(value) for value in given):
+            raise ConfigError(key, f"expected finite bounds, got {given}.")
+    upper = tuple(float(value) for value in high)
+    if low is None and not all(value > 0 for value in upper):
+        raise ConfigError(
+            "action_high",
+            f"expected positive bounds where action_low is not given, got {upper}.",
+        )
+    lower = tuple(-value for value in upper) if low is None else tuple(float(v) for v in low)
+    if not all(a < b for a, b in zip(lower, upper, strict=True)):
+        raise ConfigError("action_low", f"expected values below {upper}, got {lower}.")
+    return lower, upper

@@ -22,8 +22,8 @@ class TaskEnv(gym.Env[Any, Any]):
     """The simulated world of a task as a gymnasium environment.
 
     Observations are those of the system, in float32, without what is under way in an actuator;
-    actions are in physical units and
-    clipped to their bounds, the arithmetic is in float64. Episodes end where the task terminates
+    actions are in physical units and brought within their bounds and rate, the arithmetic is in
+    float64. Rewards are those of the task, without prices. Episodes end where the task terminates
     them; ``gymnasium.make`` applies ``task.max_steps`` by a ``TimeLimit``. Subclasses for the
     paper's systems inherit rendering from gymnasium's environments.
 
@@ -59,7 +59,7 @@ class TaskEnv(gym.Env[Any, Any]):
         render_mode: str | None = None,
     ) -> None:
         super().__init__()  # in a subclass: what gymnasium's environment needs for drawing
-        self.task = find_task(task)
+        self.task = find_task(task).unpriced()
         if actuator is not None:
             self.task = replace(self.task, actuator=actuator)
         self.plant = plant or find_plant(self.task.system)
