@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment.agent import Agent
-from phihp_torchrl.planners import CEMPlanner, cem_plan
+from phihp_torchrl.planners import CEMPlanner, cem_plan, colored
 
 Act = Callable[[Tensor, Tensor], Tensor]
 """A function from observation ``[o]`` and standard normal noise to an action ``[m]``."""
@@ -20,8 +20,9 @@ class PlanModule(nn.Module):
     """One plan of an agent as a module of tensors, for export: observation and noise to action.
 
     It reads an observation ``[o]`` and standard normal noise of shape ``noise_shape``, and returns
-    an action ``[m]``. It draws no random numbers and keeps no plan between steps, so it plans at
-    every step, regardless of ``replan_every`` and ``warm_start``.
+    an action ``[m]``. It draws no random numbers and keeps nothing between steps, so it plans at
+    every step, regardless of ``replan_every``, ``warm_start`` and ``keep_incumbent``, and the first
+    action of a plan has no ``change_cost``.
 
     Args:
         agent: an agent that plans by a :class:`~phihp_torchrl.CEMPlanner`.
@@ -55,11 +56,15 @@ class PlanModule(nn.Module):
             raise ConfigError("agent", "expected a model whose integrator compiles, got another.")
         self.planner = planner  # whose parameters are then this module's
         self.noise_shape = planner.settings.noise_shape((), agent.task.action_dim)
+        colored(
+            torch.zeros(self.noise_shape), planner.settings.noise_beta, dim=1
+        )  # cached for export
         self._observation = agent.task.observe(agent.task.sample_start([]))
 
     def forward(self, observation: Tensor, noise: Tensor) -> Tensor:
         """Return the first action of a plan, ``[m]``."""
         planner = self.planner
+        noise = colored(noise, planner.settings.noise_beta, dim=1)
         found = cem_plan(observation, noise, problem=planner.problem(), settings=planner.settings)
         return found.actions[0]
 

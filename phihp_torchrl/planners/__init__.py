@@ -5,6 +5,7 @@ from __future__ import annotations
 from phihp_torchrl.planners.candidates import Plan
 from phihp_torchrl.planners.cem import CEMConfig, cem_plan
 from phihp_torchrl.planners.cem_planner import CEMPlanner
+from phihp_torchrl.planners.colored_noise import colored
 from phihp_torchrl.planners.mppi import MPPIConfig, MPPINoise, MPPIPlan, mppi_plan
 from phihp_torchrl.planners.mppi_planner import MPPIPlanner
 from phihp_torchrl.planners.problem import Problem, TensorModel, score_sequences
@@ -21,6 +22,7 @@ __all__ = [
     "SamplingPlanner",
     "SearchConfig",
     "cem_plan",
+    "colored",
     "make_planner",
     "mppi_plan",
     "register_planner",

@@ -65,6 +65,8 @@ def score_pool(
     problem: Problem,
     settings: SearchConfig,
     policy_noise: Tensor | None = None,
+    last: Tensor | None = None,
+    completed: int = 0,
 ) -> Pool:
     """Score sequences ``[H, N, B, m]`` from states ``[B, n]``.
 
@@ -75,6 +77,8 @@ def score_pool(
         settings: the settings of the search.
         policy_noise: noise ``[H, N_pi, B, m]`` on the actor's actions, which then replace the first
             ``N_pi`` sequences.
+        last: the action before, ``[B, m]``, NaN where there is none.
+        completed: number of sequences after these whose last action is the actor's.
     """
     shape = actions.shape
     repeated = state.expand(shape[1], *state.shape).reshape(-1, *state.shape[1:])
@@ -86,6 +90,9 @@ def score_pool(
         alpha=settings.alpha,
         policy_noise=None if policy_noise is None else policy_noise.flatten(1, 2),
         reduced_tail=settings.tail_dtype == "bfloat16",
+        change_cost=settings.change_cost,
+        last=None if last is None else last.expand(shape[1], *last.shape).flatten(0, 1),
+        completed=completed * shape[2],
     )
     return Pool(actions.view(shape), scores.view(shape[1:3]))
 

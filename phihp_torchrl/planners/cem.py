@@ -17,6 +17,7 @@ from phihp_torchrl.planners.candidates import (
     score_pool,
     to_pool_layout,
 )
+from phihp_torchrl.planners.choice import between, prefer
 from phihp_torchrl.planners.problem import Problem
 from phihp_torchrl.planners.search import SearchConfig
 
@@ -33,6 +34,11 @@ class CEMConfig(SearchConfig):
             iteration, and the planner acts with it unless its plan has a higher score.
         actor_margin: least difference by which the score of the plan must be higher, in units of
             return.
+        keep_incumbent: whether the previous plan, shifted and completed by an action of the actor,
+            is a candidate in every iteration and is kept unless another plan has a higher score;
+            the mean is then sought between it and the elites' mean. Needs warm_start.
+        incumbent_margin: least difference by which the score of another plan must be higher, in
+            units of return.
         replan_every: number of actions of a plan that are taken before the next plan, RH.
         warm_start: whether a plan starts from the previous one, shifted, within an episode.
 
@@ -50,6 +56,8 @@ class CEMConfig(SearchConfig):
     select: str = "mean"
     compare_with_actor: bool = True
     actor_margin: float = 0.0
+    keep_incumbent: bool = False
+    incumbent_margin: float = 0.0
     replan_every: int = 1
     warm_start: bool = False
 
@@ -57,11 +65,13 @@ class CEMConfig(SearchConfig):
         super().__post_init__()
         check_count(self, "num_kept_elites", least=0, most="top_k")
         check_choice(self, "select", ("mean", "best"))
-        check_not_negative(self, "actor_margin")
+        check_not_negative(self, "actor_margin", "incumbent_margin")
         check_count(self, "replan_every", most="planning_horizon")
-        for name in ("compare_with_actor", "warm_start"):
+        for name in ("compare_with_actor", "keep_incumbent", "warm_start"):
             if not isinstance(value := getattr(self, name), bool):
                 raise ConfigError(name, f"expected true or false, got {value!r}.")
+        if self.keep_incumbent and not self.warm_start:
+            raise ConfigError("keep_incumbent", "expected false without warm_start, got true.")
         if self.warm_start and self.num_policy_candidates == self.num_candidates:
             raise ConfigError(
                 "warm_start",
@@ -84,6 +94,7 @@ def cem_plan(
     observation: Any,
     noise: Tensor,
     mean: Tensor | None = None,
+    last: Tensor | None = None,
     *,
     problem: Problem,
     settings: CEMConfig,
@@ -103,6 +114,9 @@ def cem_plan(
         noise: standard normal noise, ``[I, H, N, *batch, m]`` (:meth:`CEMConfig.noise_shape`).
         mean: center of the first random candidates, and itself one of them, ``[*batch, H, m]``.
             Without it the center is the middle of the bounds, which is not a candidate.
+        last: the action before, ``[*batch, m]``, for the price of a change and for
+            ``keep_incumbent``. NaN where an episode starts: then the first action has no price, and
+            ``mean`` is no plan to be kept.
         problem: model, bounds, actor and value.
         settings: settings of the search.
 
@@ -133,18 +147,30 @@ def cem_plan(
     center = bounds.center.expand(s.planning_horizon, 1, rows, action_dim)
     center = center if start is None else start
     std = (s.init_std * bounds.scale).expand(center.shape)
+    last = None if last is None else last.reshape(rows, action_dim)
 
-    pool = _first_candidates(state, noise[0], center, std, start is not None, problem, s)
+    guided = s.num_policy_candidates
+    keep = s.keep_incumbent and start is not None and last is not None
+    pool = _first_candidates(state, noise[0], center, std, start is not None, problem, s, last)
     own = pool.first(1)  # the actor's noise-free sequence, if there are candidates of the actor
-    compare = s.compare_with_actor and s.num_policy_candidates > 0
-    rescue = fallback(state, own if s.num_policy_candidates else None, center, problem)
+    compare = s.compare_with_actor and guided > 0
+    rescue = fallback(state, own if guided else None, center, problem)
+    standing = [own] if compare else []  # those that compete in every iteration
+    if keep:
+        incumbent = Pool(pool.actions[:, guided : guided + 1], pool.scores[guided : guided + 1])
+        known = last.isfinite().all(-1)  # type: ignore[union-attr]
+        incumbent = Pool(incumbent.actions, incumbent.scores.masked_fill(~known, BAD))
+        standing.append(incumbent)
     best = kept = None
     for iteration_noise in noise.unbind(0):
+        places = [0] if compare else []
+        if keep:
+            places.append(guided if best is None else len(places))
         if best is not None:
             sampled = bounds.clip(center + std * iteration_noise)
-            pool = score_pool(state, sampled, problem, s)
+            pool = score_pool(state, sampled, problem, s, last=last)
             # Candidates of earlier iterations keep their scores, since the model is deterministic.
-            rivals = [*([own] if compare else []), *([kept] if kept is not None else [])]
+            rivals = [*standing, *([kept] if kept is not None else [])]
             if rivals:
                 pool = Pool(
                     torch.cat([*(r.actions for r in rivals), pool.actions], 1),
@@ -155,17 +181,21 @@ def cem_plan(
         best = leader if best is None else leader.where(leader.scores > best.scores, best)
         if s.num_kept_elites:
             kept = elites.first(s.num_kept_elites)
-            if compare:  # the actor's sequence, first in the pool, is a candidate again anyway
-                again = index[: s.num_kept_elites] == 0
+            for place in places:  # those that compete again anyway
+                again = index[: s.num_kept_elites] == place
                 kept = Pool(kept.actions, kept.scores.masked_fill(again, BAD))
         center, std = _refit(elites, center, std, s.min_std * bounds.scale)
         center = bounds.clip(center)  # rounding may take a mean of values at a bound out of bounds
 
     assert best is not None  # there is at least one iteration
     chosen = best if s.select == "best" else Pool(center, best.scores)
+    if keep:
+        chosen = between(state, center, incumbent.actions, last, problem, s)
+        chosen = prefer(best, chosen, 0.0)
+        chosen = prefer(chosen, incumbent, s.incumbent_margin)
+    elif compare and s.select == "mean":
+        chosen = score_pool(state, center, problem, s, last=last)
     if compare:
-        if s.select == "mean":
-            chosen = score_pool(state, center, problem, s)
         # The actor's sequence, unless the plan is better; the best candidate if its score is bad.
         rival = own.where(own.scores > BAD, best)
         chosen = chosen.where(chosen.scores > own.scores + s.actor_margin, rival)
@@ -182,18 +212,20 @@ def _first_candidates(
     center_competes: bool,
     problem: Problem,
     settings: CEMConfig,
+    last: Tensor | None,
 ) -> Pool:
     """Score the actor's sequences (noise-free first), then Gaussian ones."""
     guided, limit = settings.num_policy_candidates, settings.policy_noise_clip
     actions = problem.bounds.clip(center + std * noise)
     if center_competes and guided < settings.num_candidates:
         actions = torch.cat([actions[:, :guided], center, actions[:, guided + 1 :]], 1)
+    completed = int(settings.keep_incumbent and center_competes)
     if not guided:
-        return score_pool(state, actions, problem, settings)
+        return score_pool(state, actions, problem, settings, None, last, completed)
     policy_noise = (settings.policy_noise * noise[:, :guided]).clamp(-limit, limit)
     policy_noise = policy_noise * problem.bounds.scale
     policy_noise = torch.cat([torch.zeros_like(center), policy_noise[:, 1:]], 1)
-    return score_pool(state, actions, problem, settings, policy_noise)
+    return score_pool(state, actions, problem, settings, policy_noise, last, completed)
 
 
 def _refit(elites: Pool, center: Tensor, std: Tensor, min_std: Tensor) -> tuple[Tensor, Tensor]:

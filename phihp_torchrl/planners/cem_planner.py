@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from phihp_torchrl.planners.candidates import Plan
 from phihp_torchrl.planners.cem import CEMConfig, cem_plan
+from phihp_torchrl.planners.colored_noise import colored
 from phihp_torchrl.planners.receding_horizon import RecedingHorizon
 from phihp_torchrl.planners.sampling_planner import SamplingPlanner
 
@@ -103,8 +104,8 @@ class CEMPlanner(SamplingPlanner):
             top_k=top_k,
             **{"num_policy_candidates": most, **settings},
         )
-        keeps_plans = config.replan_every > 1 or config.warm_start
-        receding = RecedingHorizon(config.replan_every, config.warm_start) if keeps_plans else None
+        remembers = config.replan_every > 1 or config.warm_start or config.change_cost > 0
+        receding = RecedingHorizon(config.replan_every, config.warm_start) if remembers else None
         super().__init__(
             env,
             config,
@@ -137,12 +138,15 @@ class CEMPlanner(SamplingPlanner):
         if self.receding is None:
             actions = self.plan(tensordict, noise).actions
             return actions[..., 0, :].reshape(*batch, *self.action_spec.shape)
+        starts, center = self._starts(tensordict), self.bounds.center
+        last = self.receding.last_action(starts, center.expand(*batch, -1))
         action = self.receding.act(
-            lambda mean: self.plan(tensordict, noise, mean).actions,
+            lambda mean: self.plan(tensordict, noise, mean, last).actions,
             batch,
-            self._starts(tensordict),
-            self.bounds.center.expand(self.settings.planning_horizon, -1),
+            starts,
+            center.expand(self.settings.planning_horizon, -1),
         )
+        self.receding.record(action)
         return action.reshape(*batch, *self.action_spec.shape)
 
     @torch.no_grad()
@@ -151,6 +155,7 @@ class CEMPlanner(SamplingPlanner):
         tensordict: TensorDictBase,
         noise: Tensor | None = None,
         mean: Tensor | None = None,
+        last: Tensor | None = None,
     ) -> Plan:
         """Plan without remembering the plan; returns the whole sequence and its score.
 
@@ -159,6 +164,8 @@ class CEMPlanner(SamplingPlanner):
             noise: standard normal noise of :meth:`CEMConfig.noise_shape`. Drawn by default.
             mean: center of the first random candidates, ``[*batch, H, m]``. Defaults to the middle
                 of the bounds.
+            last: the action before, ``[*batch, m]``, for ``change_cost`` and ``keep_incumbent``;
+                NaN where an episode starts.
 
         Returns:
             Actions ``[*batch, H, m]``, in bounds, and score ``[*batch]``.
@@ -170,4 +177,7 @@ class CEMPlanner(SamplingPlanner):
             noise = self._draw(*shape)
         elif noise.shape != shape:
             raise ValueError(f"noise: expected shape {list(shape)}, got {list(noise.shape)}.")
-        return self._call_plan(tensordict, noise, mean)
+        noise = colored(noise, self.settings.noise_beta, dim=1)
+        settings = self.settings
+        last = last if settings.change_cost or settings.keep_incumbent else None
+        return self._call_plan(tensordict, noise, mean, last)

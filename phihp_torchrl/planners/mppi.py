@@ -99,6 +99,7 @@ def mppi_plan(
     noise: MPPINoise,
     mean: Tensor | None,
     min_std: Tensor,
+    last: Tensor | None = None,
     *,
     problem: Problem,
     settings: MPPIConfig,
@@ -127,6 +128,8 @@ def mppi_plan(
             bounds.
         min_std: lower limit of the std, in units of the half-range, a scalar. It is a separate
             argument so that a schedule needs to compile only once.
+        last: the action before, ``[*batch, m]``, for the price of a change; NaN where there is
+            none.
         problem: model, bounds, actor and value.
         settings: settings of the search.
 
@@ -157,6 +160,7 @@ def mppi_plan(
     state = problem.model.locate(observation)
     state = state.reshape(-1, *state.shape[len(batch) :])
 
+    last = None if last is None else last.reshape(rows, action_dim)
     center = bounds.center.expand(horizon, 1, rows, action_dim)
     center = center if mean is None else to_pool_layout(mean, rows)
     limits = (min_std * bounds.scale, s.init_std * bounds.scale)
@@ -165,10 +169,11 @@ def mppi_plan(
     guided = None
     if s.num_policy_candidates:
         policy_noise = noise.policy.reshape(horizon, -1, rows, action_dim)
-        guided = _policy_candidates(state, policy_noise, problem, s)
+        guided = _policy_candidates(state, policy_noise, last, problem, s)
     rescue = fallback(state, None if guided is None else guided.first(1), center, problem)
     for iteration_noise in samples.unbind(0):
-        pool = score_pool(state, bounds.clip(center + std * iteration_noise), problem, s)
+        sampled = bounds.clip(center + std * iteration_noise)
+        pool = score_pool(state, sampled, problem, s, last=last)
         if guided is not None:  # their scores are known, since the model is deterministic
             pool = Pool(
                 torch.cat([guided.actions, pool.actions], 1),
@@ -203,12 +208,14 @@ def elite_weights(scores: Tensor, temperature: float) -> Tensor:
     return torch.where(good[:1], logits, torch.zeros_like(logits)).softmax(0)
 
 
-def _policy_candidates(state: Any, noise: Tensor, problem: Problem, settings: MPPIConfig) -> Pool:
+def _policy_candidates(
+    state: Any, noise: Tensor, last: Tensor | None, problem: Problem, settings: MPPIConfig
+) -> Pool:
     """Score the actor's sequences, the noise-free one first; ``noise`` is ``[H, N_pi, B, m]``."""
     limit = settings.policy_noise_clip
     noise = (settings.policy_noise * noise).clamp(-limit, limit) * problem.bounds.scale
     noise = torch.cat([torch.zeros_like(noise[:, :1]), noise[:, 1:]], 1)
-    return score_pool(state, torch.zeros_like(noise), problem, settings, noise)
+    return score_pool(state, torch.zeros_like(noise), problem, settings, noise, last)
 
 
 def _refit(

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from phihp_torchrl.planners.colored_noise import colored
 from phihp_torchrl.planners.mppi import MPPIConfig, MPPINoise, MPPIPlan, mppi_plan
 from phihp_torchrl.planners.receding_horizon import RecedingHorizon
 from phihp_torchrl.planners.sampling_planner import SamplingPlanner
@@ -97,13 +98,16 @@ class MPPIPlanner(SamplingPlanner):
         """
         batch = tensordict.batch_size
         cold = self.bounds.center.expand(*batch, self.settings.planning_horizon, -1)
-        mean = self.receding.recall(self._starts(tensordict), cold)
-        found = self.plan(tensordict, noise, mean)
+        starts = self._starts(tensordict)
+        mean = self.receding.recall(starts, cold)
+        last = self.receding.last_action(starts, cold[..., 0, :])
+        found = self.plan(tensordict, noise, mean, last)
         self.receding.remember(found.mean)
         action = found.actions[..., 0, :]
         if exploration_type() is ExplorationType.RANDOM:
             std = found.std[..., 0, :]
             action = self.bounds.clip(action + std * self._draw(*std.shape))
+        self.receding.record(action)
         return action.reshape(*batch, *self.action_spec.shape)
 
     @torch.no_grad()
@@ -112,6 +116,7 @@ class MPPIPlanner(SamplingPlanner):
         tensordict: TensorDictBase,
         noise: MPPINoise | None = None,
         mean: Tensor | None = None,
+        last: Tensor | None = None,
     ) -> MPPIPlan:
         """Plan without remembering the plan; returns the whole plan.
 
@@ -120,6 +125,7 @@ class MPPIPlanner(SamplingPlanner):
             noise: random numbers of the plan. Drawn by default.
             mean: center of the first random candidates, ``[*batch, H, m]``. Defaults to the middle
                 of the bounds.
+            last: the action before, ``[*batch, m]``, for ``change_cost``; NaN where there is none.
         """
         self._check_observation(tensordict)
         # Horizon and lower limit of the std are arguments of the plan, other settings constants.
@@ -128,8 +134,13 @@ class MPPIPlanner(SamplingPlanner):
             self._built_in, self._planning_functions = fixed, {}
         if noise is None:
             noise = self.draw_noise(tensordict.batch_size)
+        beta = self.settings.noise_beta
+        noise = noise._replace(
+            samples=colored(noise.samples, beta, dim=1), policy=colored(noise.policy, beta, dim=0)
+        )
         # As a tensor, because a schedule of numbers would compile at every step.
         min_std = torch.tensor(
             self.settings.min_std, dtype=self._action_low.dtype, device=self._action_low.device
         )
-        return self._call_plan(tensordict, noise, mean, min_std)
+        last = last if self.settings.change_cost else None
+        return self._call_plan(tensordict, noise, mean, min_std, last)

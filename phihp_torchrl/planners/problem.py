@@ -69,13 +69,18 @@ def score_sequences(
     alpha: float,
     policy_noise: Tensor | None = None,
     reduced_tail: bool = False,
+    change_cost: float = 0.0,
+    last: Tensor | None = None,
+    completed: int = 0,
 ) -> tuple[Tensor, Tensor]:
     r"""Score action sequences by rolling them out in the model (paper, equation 4).
 
     .. math::
-        \sum_{k<H} \gamma^k r_k + \alpha \gamma^H \min(Q_1, Q_2)(s_H, \pi(s_H)),
+        \sum_{k<H} \gamma^k \big(r_k - c\,|a_k - a_{k-1}|^2\big)
+        + \alpha \gamma^H \min(Q_1, Q_2)(s_H, \pi(s_H)),
 
-    where terms after a termination are 0. A score that is not finite becomes -inf.
+    where terms after a termination are 0, and changes are in units of the action's half-range. A
+    score that is not finite becomes -inf.
 
     Args:
         state: first state of each sequence, ``[rows, n]``.
@@ -86,6 +91,10 @@ def score_sequences(
         policy_noise: noise ``[H, rows', m]`` on the actor's actions, which replace the actions of
             the first ``rows'`` sequences; they are clipped with the noise.
         reduced_tail: whether to evaluate the value term in bfloat16.
+        change_cost: price c of a change of the action, which is not in the paper.
+        last: the action before the first ones, ``[rows, m]``; NaN, or ``None``, where there is
+            none, so that the first action has no price.
+        completed: number of sequences after the first ``rows'`` whose last action is the actor's.
 
     Returns:
         The scores ``[rows]``, and the sequences with the actor's actions in them,
@@ -93,14 +102,25 @@ def score_sequences(
     """
     model, actor = problem.model, problem.actor
     taken = []
-    discount = 1.0
+    discount, previous = 1.0, last
     for k, action in enumerate(actions.unbind(0)):
-        if policy_noise is not None and actor is not None:
-            guided = policy_noise.shape[1]
-            proposal = actor(model.observe(state[:guided])) + policy_noise[k]
-            action = torch.cat([problem.bounds.clip(proposal), action[guided:]])
+        noise = None if policy_noise is None else policy_noise[k]
+        if completed and k == len(actions) - 1:
+            none = torch.zeros_like(action[:completed])
+            noise = none if noise is None else torch.cat([noise, none])
+        if actor is not None and (noise is not None or completed):
+            if noise is not None:
+                guided = noise.shape[0]
+                proposal = actor(model.observe(state[:guided])) + noise
+                action = torch.cat([problem.bounds.clip(proposal), action[guided:]])
             taken.append(action)
         state, reward, terminated = model.transition(state, action)
+        if change_cost:
+            if previous is not None:
+                change = (action - previous) / problem.bounds.scale
+                # Before the first action of an episode there is none, which NaN says.
+                reward = reward - change_cost * change.square().sum(-1).nan_to_num(0.0)
+            previous = action
         if k == 0:
             total, over = reward, terminated
         else:

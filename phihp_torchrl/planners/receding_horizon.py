@@ -25,9 +25,10 @@ class RecedingHorizon:
         self.clear()
 
     def clear(self) -> None:
-        """Drop all plans."""
+        """Drop all plans, and the last action."""
         self._plans: Tensor | None = None
         self._age: Tensor | None = None
+        self._last: Tensor | None = None
 
     def act(
         self,
@@ -82,6 +83,23 @@ class RecedingHorizon:
     def remember(self, plans: Tensor) -> None:
         """Keep ``plans`` ``[*batch, H, m]`` for :meth:`recall`."""
         self._plans = plans
+
+    def last_action(self, is_init: Tensor | None, like: Tensor) -> Tensor:
+        """Return the action that was taken last, NaN where an episode starts.
+
+        Args:
+            is_init: whether an episode starts, bool ``[*batch]``; ``None`` if unknown.
+            like: a tensor of the shape, dtype and device of the actions, ``[*batch, m]``.
+        """
+        none = torch.full_like(like, torch.nan, memory_format=torch.contiguous_format)
+        last = self._last
+        if last is None or last.shape != none.shape or last.device != none.device:
+            return none
+        return last if is_init is None else torch.where(is_init[..., None], none, last)
+
+    def record(self, action: Tensor) -> None:
+        """Keep an action ``[*batch, m]`` for :meth:`last_action`."""
+        self._last = action
 
     def _fits(self, cold: Tensor) -> bool:
         plans = self._plans

@@ -37,6 +37,10 @@ class SearchConfig:
         init_std: std of the random candidates in the first iteration, in units of the action's
             half-range.
         min_std: lower limit of the refitted std, in the same units.
+        noise_beta: exponent β of the spectrum of the noise along the horizon: 0 for white noise, 1
+            for pink, 2 for that of a random walk; more is smoother.
+        change_cost: price of a change of the action from one step to the next, in units of reward
+            for a change by the half-range, squared. It is part of the score of every sequence.
         tail_dtype: precision of actor and Q beyond the horizon, float32 or bfloat16 (faster,
             accurate to about three digits; the last layer of this package's critics stays in
             float32).
@@ -64,6 +68,8 @@ class SearchConfig:
     gamma: float = 0.99
     init_std: float = 1.0
     min_std: float = 0.0
+    noise_beta: float = 0.0
+    change_cost: float = 0.0
     tail_dtype: str = "float32"
 
     def __post_init__(self) -> None:
@@ -71,6 +77,7 @@ class SearchConfig:
         check_count(self, "top_k", most="num_candidates")
         check_count(self, "num_policy_candidates", least=0, most="num_candidates")
         check_not_negative(self, "policy_noise", "policy_noise_clip", "min_std", "alpha")
+        check_not_negative(self, "noise_beta", "change_cost")
         check_positive(self, "init_std")
         check_share(self, "gamma")
         check_choice(self, "tail_dtype", ("float32", "bfloat16"))

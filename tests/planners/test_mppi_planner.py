@@ -48,9 +48,9 @@ def test_a_plan_starts_from_the_one_before_shifted():
     seen = []
     plan_once = planner.plan
 
-    def spy(tensordict, noise, mean):
+    def spy(tensordict, noise, mean, last):
         seen.append(mean)
-        return plan_once(tensordict, noise, mean)
+        return plan_once(tensordict, noise, mean, last)
 
     planner.plan = spy
     planner(td.clone())
@@ -95,9 +95,9 @@ def test_a_cold_start_and_exploration_within_lopsided_bounds():
     assert torch.equal(planner.receding.recall(None, cold), cold)
     seen, plan_once = [], planner.plan
 
-    def spy(tensordict, noise, mean):
+    def spy(tensordict, noise, mean, last):
         seen.append(mean)
-        return plan_once(tensordict, noise, mean)
+        return plan_once(tensordict, noise, mean, last)
 
     planner.plan = spy
     planner(td)

@@ -15,7 +15,7 @@ def scripted(planner, monkeypatch):
     """Plans that count: step k of plan p is 10 p + k. Returns the list of means given."""
     means = []
 
-    def plan_of(tensordict, noise=None, mean=None):
+    def plan_of(tensordict, noise=None, mean=None, last=None):
         number, horizon = len(means), planner.settings.planning_horizon
         means.append(mean)
         sequence = 10.0 * number + torch.arange(horizon)
