@@ -18,7 +18,7 @@ from phihp_torchrl.agents.equations import (
     q_values,
 )
 from phihp_torchrl.compilation import compile_graph
-from phihp_torchrl.config import check_count, check_positive
+from phihp_torchrl.config import Steps, check_count, check_positive, check_steps, resolve_seconds
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Rollouts, finite_transition
 from phihp_torchrl.tasks import ActionBounds
@@ -40,7 +40,8 @@ class RefitConfig:
             one fit at the end only.
         interval: critic updates between two such fits; 0 for no fit.
         transitions: number of actions whose returns are imagined.
-        horizon: model steps in a return, after which the value of the critics is added.
+        horizon: model steps in a return, after which the value of the critics is added, or their
+            duration, such as "4 s".
         steps: steps of Adam in a fit, with cosine decay of the learning rate.
         batch_size: returns in a step of Adam.
         learning_rate: initial learning rate of Adam.
@@ -57,13 +58,14 @@ class RefitConfig:
     start: int = 4000
     interval: int = 2000
     transitions: int = 16384
-    horizon: int = 100
+    horizon: Steps = 100
     steps: int = 1500
     batch_size: int = 512
     learning_rate: float = 1e-3
 
     def __post_init__(self) -> None:
-        check_count(self, "transitions", "horizon", "steps", "batch_size")
+        check_steps(self, "horizon")
+        check_count(self, "transitions", "steps", "batch_size")
         check_count(self, "start", "interval", least=0)
         check_positive(self, "learning_rate")
 
@@ -139,7 +141,7 @@ class CriticRefit:
     ) -> None:
         self.world_model = world_model
         self.rollouts = rollouts
-        self.config = config
+        self.config = resolve_seconds(config, world_model.task.time_step)
         self.gamma = gamma
         self._step = compile_graph(_step, enabled=compile)
 

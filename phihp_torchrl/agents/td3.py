@@ -23,11 +23,16 @@ from phihp_torchrl.agents.equations import (
 from phihp_torchrl.agents.networks import make_actor, make_qvalue
 from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.config import (
+    Discount,
+    Steps,
     check_count,
+    check_discount,
     check_not_negative,
     check_positive,
     check_positive_share,
+    check_steps,
     check_widths,
+    resolve_seconds,
 )
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Batch
@@ -59,13 +64,14 @@ class TD3Config:
         actor_learning_rate: learning rate of the actor.
         critic_learning_rate: learning rate of the critics.
         last_layer_scale: factor on the initial weights of the actor's last layer.
-        gamma: discount γ.
+        gamma: discount γ, or its time constant, such as "5 s".
         tau: step τ of the target networks towards the networks, in each update of the actor.
         policy_delay: critic updates for each update of the actor.
         target_noise: std of the noise on target actions, in units of the action's half-range.
         target_noise_clip: largest absolute value of that noise, in the same units.
         value_expansion: number of rewards in the value target; the first is that of the transition,
-            the others come from the model (Acrobot needs 5).
+            the others come from the model (Acrobot needs 5). Or their duration, such as
+            "0.2 s".
 
     Raises:
         ConfigError: for a value out of range; the message names the field.
@@ -74,7 +80,8 @@ class TD3Config:
         >>> TD3Config(gamma=1.5)
         Traceback (most recent call last):
         ...
-        phihp_torchrl.config.ConfigError: gamma: expected a number in (0, 1], got 1.5.
+        phihp_torchrl.config.ConfigError: gamma: expected a number in (0, 1], or a time constant \
+such as '5 s', got 1.5.
     """
 
     actor_hidden_sizes: tuple[int, ...] = (300, 300)
@@ -82,18 +89,20 @@ class TD3Config:
     actor_learning_rate: float = 3e-4
     critic_learning_rate: float = 1e-3
     last_layer_scale: float = 0.1
-    gamma: float = 0.99
+    gamma: Discount = 0.99
     tau: float = 0.02
     policy_delay: int = 2
     target_noise: float = 0.1
     target_noise_clip: float = 0.5
-    value_expansion: int = 1
+    value_expansion: Steps = 1
 
     def __post_init__(self) -> None:
         check_widths(self, "actor_hidden_sizes", "critic_hidden_sizes")
         check_positive(self, "actor_learning_rate", "critic_learning_rate")
-        check_count(self, "policy_delay", "value_expansion")
-        check_positive_share(self, "gamma", "tau")
+        check_count(self, "policy_delay")
+        check_steps(self, "value_expansion")
+        check_discount(self, "gamma")
+        check_positive_share(self, "tau")
         check_not_negative(self, "target_noise", "target_noise_clip", "last_layer_scale")
 
 
@@ -116,6 +125,7 @@ def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
         [(8, 3), (8,), (1, 8), (1,)]
     """
     task = world_model.task
+    config = resolve_seconds(config, task.time_step)
     bounds = task.bounds
     loss = TD3Loss(
         make_actor(task, config.actor_hidden_sizes, config.last_layer_scale),
@@ -186,7 +196,7 @@ class TD3Update(nn.Module):
         super().__init__()
         self.loss = loss
         self.world_model = world_model
-        self.config = config
+        self.config = config = resolve_seconds(config, world_model.task.time_step)
         self._networks: Networks | None = None
         self._bounds: ActionBounds | None = None
         for name, group in (("actor", self.actor), ("critics", self.critics)):

@@ -28,6 +28,18 @@ from phihp_torchrl.config.compose import (
     override_lines,
     parse_overrides,
 )
+from phihp_torchrl.config.durations import (
+    Discount,
+    Steps,
+    check_discount,
+    check_steps,
+    discount_of,
+    in_seconds,
+    parse_seconds,
+    refuse_seconds,
+    resolve_seconds,
+    steps_in,
+)
 from phihp_torchrl.config.errors import ConfigError
 from phihp_torchrl.config.help import help_text, sentences, sentences_of, settings_text
 from phihp_torchrl.config.methods import METHODS, Method, get_method, register_method
@@ -43,4 +55,11 @@ from phihp_torchrl.config.typed import (
     to_mapping,
 )
 
-__all__ = ["ConfigError", "Method", "get_method", "load_config", "register_method"]
+__all__ = [
+    "ConfigError",
+    "Method",
+    "get_method",
+    "load_config",
+    "register_method",
+    "resolve_seconds",
+]

@@ -84,7 +84,8 @@ def check_count(config: object, *names: str, least: int = 1, most: str | None = 
         config: the settings.
         names: names of the fields to check.
         least: the smallest allowed number.
-        most: name of the field that holds the largest allowed number; ``None`` for no limit.
+        most: name of the field that holds the largest allowed number; ``None`` for no limit, and
+            none either while one of both is a text of seconds.
 
     Raises:
         ConfigError: for the first such field.
@@ -99,7 +100,7 @@ def check_count(config: object, *names: str, least: int = 1, most: str | None = 
     _check(config, names, f"a whole number >= {least}", lambda value: is_whole(value, least))
     for name in names if most is not None else ():
         value, limit = getattr(config, name), getattr(config, str(most))
-        if value > limit:
+        if not isinstance(limit, str) and value > limit:
             raise ConfigError(name, f"expected at most {most} = {limit}, got {value}.")
 
 

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
 from phihp_torchrl.agents import Actor, TwinQ
-from phihp_torchrl.config import ConfigError, kind_mapping, read_kind
+from phihp_torchrl.config import ConfigError, kind_mapping, read_kind, resolve_seconds
 from phihp_torchrl.deployment.under_way import UnderWay
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.planners import PLANNERS, SamplingPlanner, SearchConfig, make_planner
@@ -90,6 +90,10 @@ class Agent(TensorDictModuleBase):
         self.dynamics = dynamics
         self.actor = actor
         self.qvalue = qvalue
+        if planner_config is not None:
+            planner_config = resolve_seconds(planner_config, task.time_step)
+        if planner_config is not None:
+            planner_config = resolve_seconds(planner_config, task.time_step)
         self.planner_config = planner_config
         self.metadata = dict(metadata or {})
         self._memory = UnderWay(task) if task.register_count else None

@@ -8,7 +8,15 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_choice, check_count, check_not_negative
+from phihp_torchrl.config import (
+    ConfigError,
+    Steps,
+    check_choice,
+    check_count,
+    check_not_negative,
+    check_steps,
+    in_seconds,
+)
 from phihp_torchrl.planners.candidates import (
     BAD,
     Plan,
@@ -39,7 +47,8 @@ class CEMConfig(SearchConfig):
             the mean is then sought between it and the elites' mean. Needs warm_start.
         incumbent_margin: least difference by which the score of another plan must be higher, in
             units of return.
-        replan_every: number of actions of a plan that are taken before the next plan, RH.
+        replan_every: number of actions of a plan that are taken before the next plan, RH, or their
+            duration.
         warm_start: whether a plan starts from the previous one, shifted, within an episode.
 
     Raises:
@@ -58,7 +67,7 @@ class CEMConfig(SearchConfig):
     actor_margin: float = 0.0
     keep_incumbent: bool = False
     incumbent_margin: float = 0.0
-    replan_every: int = 1
+    replan_every: Steps = 1
     warm_start: bool = False
 
     def __post_init__(self) -> None:
@@ -66,7 +75,9 @@ class CEMConfig(SearchConfig):
         check_count(self, "num_kept_elites", least=0, most="top_k")
         check_choice(self, "select", ("mean", "best"))
         check_not_negative(self, "actor_margin", "incumbent_margin")
-        check_count(self, "replan_every", most="planning_horizon")
+        check_steps(self, "replan_every")
+        if not in_seconds(self.replan_every):
+            check_count(self, "replan_every", most="planning_horizon")
         for name in ("compare_with_actor", "keep_incumbent", "warm_start"):
             if not isinstance(value := getattr(self, name), bool):
                 raise ConfigError(name, f"expected true or false, got {value!r}.")

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_choice, check_not_negative
+from phihp_torchrl.config import ConfigError, Steps, check_choice, check_not_negative
 from phihp_torchrl.planners.candidates import BAD, Pool, fallback, score_pool, to_pool_layout
 from phihp_torchrl.planners.problem import Problem
 from phihp_torchrl.planners.search import SearchConfig
@@ -39,7 +39,7 @@ class MPPIConfig(SearchConfig):
 
     kind: ClassVar[str] = "mppi"
 
-    planning_horizon: int = 5
+    planning_horizon: Steps = 5
     optim_steps: int = 4
     num_candidates: int = 134
     top_k: int = 16

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from phihp_torchrl.config import ConfigError, Registry, offer, to_mapping
+from phihp_torchrl.config import ConfigError, Registry, offer, resolve_seconds, to_mapping
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import WorldModelEnv
 from phihp_torchrl.planners.cem import CEMConfig
@@ -111,6 +111,7 @@ def make_planner(
     """
     # A planner never resets its env. With a seed, torch's global generator is not advanced.
     env = WorldModelEnv(world_model, seed=0)
+    config = resolve_seconds(config, world_model.task.time_step)
     build = PLANNERS.find(config.kind).build
     return build(env, config, actor=actor, qvalue=qvalue, compile=compile, generator=generator)
 

@@ -17,6 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MPCPlannerBase
 
 from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.config import refuse_seconds
 from phihp_torchrl.planners.env_model import (
     EnvModel,
     find_action,
@@ -99,6 +100,8 @@ class SamplingPlanner(MPCPlannerBase):
         compile: bool | dict[str, Any] = False,
         generator: torch.Generator | None = None,
     ) -> None:
+        refuse_seconds(settings)
+        refuse_seconds(settings)  # an environment does not say how long its step is
         action_key, reward_key = unravel_key(action_key), unravel_key(reward_key)
         action_spec = find_action(env, action_key)
         super().__init__(env, action_key=action_key)

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from phihp_torchrl.config import (
+    Discount,
+    Steps,
     check_choice,
     check_count,
+    check_discount,
     check_not_negative,
     check_positive,
-    check_share,
+    check_steps,
 )
 
 
@@ -23,7 +26,7 @@ class SearchConfig:
     are those of the paper, section 4.3 and its tables.
 
     Args:
-        planning_horizon: actions in a plan, H.
+        planning_horizon: actions in a plan, H, or its duration, such as "0.4 s".
         optim_steps: iterations of sampling, scoring and refitting, I.
         num_candidates: candidates in an iteration, N = N_π + N_rand.
         top_k: number of elites, to which the Gaussian is refitted, K.
@@ -33,7 +36,7 @@ class SearchConfig:
             half-range.
         policy_noise_clip: largest absolute value of that noise, in the same units.
         alpha: weight α of the value beyond the horizon.
-        gamma: discount γ of rewards, also without Q.
+        gamma: discount γ of rewards, also without Q, or its time constant, such as "5 s".
         init_std: std of the random candidates in the first iteration, in units of the action's
             half-range.
         min_std: lower limit of the refitted std, in the same units.
@@ -57,7 +60,7 @@ class SearchConfig:
 
     kind: ClassVar[str]
 
-    planning_horizon: int = 10
+    planning_horizon: Steps = 10
     optim_steps: int = 2
     num_candidates: int = 64
     top_k: int = 6
@@ -65,7 +68,7 @@ class SearchConfig:
     policy_noise: float = 0.2
     policy_noise_clip: float = 0.6
     alpha: float = 1.0
-    gamma: float = 0.99
+    gamma: Discount = 0.99
     init_std: float = 1.0
     min_std: float = 0.0
     noise_beta: float = 0.0
@@ -73,11 +76,12 @@ class SearchConfig:
     tail_dtype: str = "float32"
 
     def __post_init__(self) -> None:
-        check_count(self, "planning_horizon", "optim_steps", "num_candidates")
+        check_steps(self, "planning_horizon")
+        check_count(self, "optim_steps", "num_candidates")
         check_count(self, "top_k", most="num_candidates")
         check_count(self, "num_policy_candidates", least=0, most="num_candidates")
         check_not_negative(self, "policy_noise", "policy_noise_clip", "min_std", "alpha")
         check_not_negative(self, "noise_beta", "change_cost")
         check_positive(self, "init_std")
-        check_share(self, "gamma")
+        check_discount(self, "gamma", least_open=False)
         check_choice(self, "tail_dtype", ("float32", "bfloat16"))

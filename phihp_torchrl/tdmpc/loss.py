@@ -14,7 +14,12 @@ from torchrl.objectives import LossModule
 
 from phihp_torchrl.agents import soft_update_
 from phihp_torchrl.compilation import compile_graph
-from phihp_torchrl.config import check_not_negative, check_positive_share
+from phihp_torchrl.config import (
+    Discount,
+    check_discount,
+    check_not_negative,
+    check_positive_share,
+)
 from phihp_torchrl.tdmpc.equations import (
     ModelLosses,
     Slices,
@@ -33,7 +38,7 @@ class TDMPCLossConfig:
     """Weights of the losses of TD-MPC.
 
     Args:
-        gamma: discount γ.
+        gamma: discount γ, or its time constant, such as "5 s".
         rho: weight ρ of a step relative to the one before.
         consistency_coef: weight of the error of the latent.
         reward_coef: weight of the error of the reward.
@@ -48,7 +53,7 @@ class TDMPCLossConfig:
         ConfigError: for a value out of range; the message names the field.
     """
 
-    gamma: float = 0.99
+    gamma: Discount = 0.99
     rho: float = 0.5
     consistency_coef: float = 2.0
     reward_coef: float = 0.5
@@ -58,7 +63,8 @@ class TDMPCLossConfig:
     output_penalty: float = 0.005
 
     def __post_init__(self) -> None:
-        check_positive_share(self, "gamma", "rho")
+        check_discount(self, "gamma")
+        check_positive_share(self, "rho")
         coefficients = [f"{name}_coef" for name in ("consistency", "reward", "value")]
         check_not_negative(
             self, *coefficients, "termination_coef", "policy_noise", "output_penalty"

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict.nn import TensorDictModule
 
-from phihp_torchrl.config import ConfigError, check_count
+from phihp_torchrl.config import ConfigError, Steps, check_count, check_steps, in_seconds
 from phihp_torchrl.planners import MPPIConfig, MPPIPlanner
 from phihp_torchrl.tdmpc.latent_env import LatentEnv
 from phihp_torchrl.tdmpc.networks import TOLD
@@ -23,7 +23,7 @@ class ScheduledMPPIConfig(MPPIConfig):
     ``min_std``.
 
     Args:
-        initial_horizon: initial planning horizon.
+        initial_horizon: initial planning horizon, in steps or as a duration.
         initial_min_std: initial lower limit of the std, in units of the action's half-range.
         schedule_steps: real steps in which horizon and limit reach their final values; 0 for the
             final values from the start.
@@ -37,13 +37,15 @@ class ScheduledMPPIConfig(MPPIConfig):
         (3, 0.275)
     """
 
-    initial_horizon: int = 1
+    initial_horizon: Steps = 1
     initial_min_std: float = 0.5
     schedule_steps: int = 25_000
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_count(self, "initial_horizon", most="planning_horizon")
+        check_steps(self, "initial_horizon")
+        if not in_seconds(self.initial_horizon):
+            check_count(self, "initial_horizon", most="planning_horizon")
         check_count(self, "schedule_steps", least=0)
         if not self.min_std <= self.initial_min_std <= self.init_std:
             raise ConfigError(

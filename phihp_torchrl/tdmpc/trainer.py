@@ -14,10 +14,14 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from phihp_torchrl.agents import learning_rate_scale
 from phihp_torchrl.config import (
     ConfigError,
+    Steps,
     check_count,
     check_not_negative,
     check_positive,
     check_share,
+    check_steps,
+    in_seconds,
+    resolve_seconds,
 )
 from phihp_torchrl.evaluation import evaluate
 from phihp_torchrl.tasks import Task
@@ -48,7 +52,7 @@ class TDMPCTrainConfig:
         real_steps: total number of real transitions.
         seed_steps: real transitions under random actions, before the first update.
         updates_per_step: updates for each real step, made after the episode.
-        horizon: transitions in a slice, over which the model is unrolled.
+        horizon: transitions in a slice, over which the model is unrolled, or their duration.
         batch_size: slices in an update.
         replay_capacity: transitions kept for replay, including the padding after episodes.
         priority_alpha: exponent α of the priorities; 0 for uniform sampling.
@@ -75,7 +79,7 @@ horizon=5, got 9.
     real_steps: int = 30_000
     seed_steps: int = 5000
     updates_per_step: float = 0.5
-    horizon: int = 5
+    horizon: Steps = 5
     batch_size: int = 128
     replay_capacity: int = 1_000_000
     priority_alpha: float = 0.6
@@ -87,12 +91,13 @@ horizon=5, got 9.
     planner: ScheduledMPPIConfig = field(default_factory=ScheduledMPPIConfig)
 
     def __post_init__(self) -> None:
-        check_count(self, "real_steps", "horizon", "batch_size", "evaluation_interval")
+        check_steps(self, "horizon")
+        check_count(self, "real_steps", "batch_size", "evaluation_interval")
         check_count(self, "seed_steps", "evaluation_episodes", least=0)
         check_not_negative(self, "priority_alpha", "priority_beta")
         check_positive(self, "updates_per_step")
         check_share(self, "decay")
-        if self.replay_capacity < 2 * self.horizon:
+        if not in_seconds(self.horizon) and self.replay_capacity < 2 * self.horizon:
             raise ConfigError(
                 "replay_capacity",
                 f"expected at least two slices of horizon={self.horizon}, "
@@ -135,7 +140,7 @@ class TDMPCTrainer:
         compile: bool = False,
     ) -> None:
         self.task = task
-        self.config = config
+        self.config = config = resolve_seconds(config, task.time_step)
         self.seed = seed
         self.world = make_world(task, world)
         self.env = self.world.make_env()

@@ -9,7 +9,13 @@ from dataclasses import dataclass, field, replace
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from phihp_torchrl.config import ConfigError, check_count, check_not_negative
+from phihp_torchrl.config import (
+    ConfigError,
+    Steps,
+    check_not_negative,
+    check_steps,
+    resolve_seconds,
+)
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.planners import CEMConfig, make_planner
 from phihp_torchrl.tasks import Task
@@ -28,15 +34,17 @@ class CollectConfig:
     """How phase 1 collects real data: with plain CEM in the model, after random steps.
 
     Args:
-        planning_horizon: actions in a plan of the CEM that collects data.
-        replan_every: number of actions of a plan that are taken before the next plan.
+        planning_horizon: actions in a plan of the CEM that collects data, or their duration, such
+            as "1 s".
+        replan_every: number of actions of a plan that are taken before the next plan, or their
+            duration.
         num_candidates: candidates in an iteration of this CEM.
         top_k: elites of this CEM.
         optim_steps: iterations of this CEM.
         noise: std of the noise on planned actions, in units of the action's half-range; it falls
             to zero over the iterations of collecting and fitting.
-        random_hold: steps for which a random action is held in the first iteration, so that slow
-            systems move.
+        random_hold: steps for which a random action is held in the first iteration, or their
+            duration, so that slow systems move.
         exploration_reward: whether to plan for the task's exploration reward, if it has one.
         exploration: how far and how fast actions may go, and where an episode ends to protect a
             plant.
@@ -49,20 +57,20 @@ class CollectConfig:
         0
     """
 
-    planning_horizon: int = 30
-    replan_every: int = 15
+    planning_horizon: Steps = 30
+    replan_every: Steps = 15
     num_candidates: int = 500
     top_k: int = 20
     optim_steps: int = 3
     noise: float = 0.3
-    random_hold: int = 1
+    random_hold: Steps = 1
     exploration_reward: bool = True
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
 
     def __post_init__(self) -> None:
         check_not_negative(self, "noise")
-        check_count(self, "random_hold")
-        if self.random_hold > 1 and self.exploration.coloured:
+        check_steps(self, "random_hold")
+        if self.random_hold != 1 and self.exploration.coloured:
             raise ConfigError(
                 "random_hold",
                 "expected 1 with exploration.bandwidth or exploration.colour, which set how slow "
@@ -99,6 +107,7 @@ def random_policy(
         generator: source of randomness.
         exploration: the limits; by default those of ``config``.
     """
+    config = resolve_seconds(config, task.time_step)
     bounds = task.bounds
     explore = exploration or Exploration(task, config.exploration)
     signal = explore.signal(generator) if explore.config.coloured else None

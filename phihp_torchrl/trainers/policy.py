@@ -24,9 +24,7 @@ from phihp_torchrl.agents import (
     scaled,
     visited_states,
 )
-from phihp_torchrl.config import (
-    ConfigError,
-)
+from phihp_torchrl.config import ConfigError, resolve_seconds
 from phihp_torchrl.dynamics import (
     HybridDynamics,
     PhysicsPrior,
@@ -108,7 +106,8 @@ class PolicyTrainer(TD3Trainer):
         compile: bool = False,
         covariance: Tensor | None = None,
     ) -> None:
-        self.task, self.config = task, config
+        self.task = task
+        self.config = config = resolve_seconds(config, task.time_step)
         self.shifts = _draw(dynamics, config, covariance, seed)
         self.start_states = make_start_states(task, config.start, states=data_states)
         model = TaskWorldModel(task, per_life(dynamics, self.shifts))

@@ -10,11 +10,13 @@ from phihp_torchrl.agents import (
 )
 from phihp_torchrl.config import (
     ConfigError,
+    Steps,
     check_choice,
     check_count,
     check_not_negative,
     check_positive,
     check_share,
+    check_steps,
 )
 from phihp_torchrl.imagination import StartConfig
 
@@ -33,12 +35,13 @@ class PolicyConfig:
         random_steps: imagined transitions under random actions before the first update.
         exploration_noise: std of the noise on actions, in units of the action's half-range.
         random_fraction: share of actions that are uniformly random.
-        max_age: steps after which an imagined episode is truncated; null for the task's limit.
+        max_age: steps after which an imagined episode is truncated, or their duration, such as
+            "6 s"; null for the task's limit.
         decay: share of the updates, at the end, over which learning rates fall to a twentieth.
         evaluation_interval: updates between two evaluations in the model, which choose the actor to
             keep.
         evaluation_episodes: imagined episodes in an evaluation.
-        evaluation_steps: steps in these episodes; null for the task's limit.
+        evaluation_steps: steps in these episodes, or their duration; null for the task's limit.
         real_evaluation_episodes: episodes of the actor in a simulated world at each evaluation,
             which are logged and not used for training; 0 for none.
         max_seconds: duration after which the phase ends early; null for no limit.
@@ -71,11 +74,11 @@ class PolicyConfig:
     random_steps: int = 2048
     exploration_noise: float = 0.1
     random_fraction: float = 0.1
-    max_age: int | None = None
+    max_age: Steps | None = None
     decay: float = 0.5
     evaluation_interval: int = 500
     evaluation_episodes: int = 64
-    evaluation_steps: int | None = None
+    evaluation_steps: Steps | None = None
     real_evaluation_episodes: int = 10
     max_seconds: float | None = None
     scales: str = "auto"
@@ -113,8 +116,9 @@ class PolicyConfig:
                 f"expected null without draw_constants=true, got {self.constants_std}.",
             )
         for name in ("max_age", "evaluation_steps", "max_seconds", "constants_std"):
+            check = check_steps if name in ("max_age", "evaluation_steps") else check_positive
             if getattr(self, name) is not None:
-                check_positive(self, name)
+                check(self, name)
         chunk_updates = self.chunk_steps * self.updates_per_step
         for name, value in (
             ("chunk_steps * updates_per_step", chunk_updates),

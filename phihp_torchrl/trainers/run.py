@@ -16,7 +16,7 @@ import torch
 from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from tqdm.auto import tqdm
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, resolve_seconds
 from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.trainers.checkpoints import (
     clear_rotation,
@@ -165,7 +165,7 @@ class _Run:
     def _make_phase(self, name: str) -> Phase:
         context = Context(
             config=self.config,
-            settings=self.config.section(name),
+            settings=resolve_seconds(self.config.section(name), self.world.task.time_step),
             task=self.world.task,
             world=self.world,
             before=dict(self.phases),

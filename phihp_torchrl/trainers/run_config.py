@@ -19,6 +19,7 @@ from phihp_torchrl.config import (
     get_method,
     override_key,
     parse_overrides,
+    resolve_seconds,
     to_mapping,
 )
 from phihp_torchrl.evaluation import check_training_seed
@@ -308,9 +309,16 @@ def check_run(config: RunConfig, world: World) -> None:
 
     Raises:
         ConfigError: if the system has no prior or the world is not simulated, where one is needed,
-            and for constants to draw where none are learned.
+            for constants to draw where none are learned, and for seconds that are too few for a
+            step of the task or do not fit other settings.
     """
     task = world.task
+    for name, section in {**config.sections, "planner": config.planner}.items():
+        if section is not None:
+            try:
+                resolve_seconds(section, task.time_step)
+            except ConfigError as error:
+                raise error.inside(name) from error
     kind = getattr(config.sections.get("model"), "kind", None)
     if kind in ("hybrid", "prior") and not task.system.has_prior:
         raise ConfigError(

@@ -73,7 +73,10 @@ def test_sentences_are_by_dotted_key() -> None:
         "defaults:\n  # which\n  - override world: simulated\n"
     )
     assert sentences(text) == {"a": "top", "a.b": "inner one and two", "world": "which"}
-    assert sentences((YAML / "defaults.yaml").read_text())["policy.td3.gamma"] == "discount γ"
+    assert (
+        sentences((YAML / "defaults.yaml").read_text())["policy.td3.gamma"]
+        == 'discount γ, or its time constant, such as "5 s"'
+    )
 
 
 CHECK = """
