@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from phihp_torchrl.deployment.agent import Agent
+from phihp_torchrl.deployment.control_report import ControlReport
+from phihp_torchrl.deployment.controller import Controller
 from phihp_torchrl.deployment.export import (
     PlanModule,
     export_aoti,
@@ -11,13 +13,18 @@ from phihp_torchrl.deployment.export import (
 )
 from phihp_torchrl.deployment.files import AGENT_KINDS, load_agent, register_agent, save_agent
 from phihp_torchrl.deployment.formats import TaskSignature
+from phihp_torchrl.deployment.observer import VelocityObserver
 from phihp_torchrl.deployment.reading import AgentError
 from phihp_torchrl.deployment.realtime import RealTimeReport, run_realtime
+from phihp_torchrl.deployment.safety import Safety
 
 __all__ = [
     "Agent",
     "AgentError",
+    "Controller",
     "PlanModule",
+    "Safety",
+    "VelocityObserver",
     "export_aoti",
     "export_onnx",
     "load_agent",

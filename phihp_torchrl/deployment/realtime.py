@@ -10,8 +10,11 @@ from dataclasses import dataclass, replace
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.deployment.control_report import ControlReport
+from phihp_torchrl.deployment.controller import Controller
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld
@@ -26,12 +29,15 @@ class RealTimeReport:
         milliseconds: time from a tick to its action, for each action, ``[actions]``.
         missed: ticks at which no new action was ready, because one took longer than a period.
         mean_reward: mean reward of the ticks.
+        control: what a :class:`~phihp_torchrl.deployment.Controller` says of its steps; ``None``
+            for another policy.
     """
 
     rate: float
     milliseconds: torch.Tensor
     missed: int
     mean_reward: float
+    control: ControlReport | None = None
 
     def summary(self) -> dict[str, float]:
         """Return rate, quantiles, missed ticks and mean reward, as numbers for a table."""
@@ -49,7 +55,7 @@ class RealTimeReport:
 
 @torch.no_grad()
 def run_realtime(
-    policy: TensorDictModuleBase,
+    policy: TensorDictModuleBase | Controller,
     task: str | Task,
     *,
     rate: float,
@@ -65,8 +71,8 @@ def run_realtime(
     missed.
 
     Args:
-        policy: a module that reads ``"observation"`` and writes ``"action"``. If it compiles, call
-            it once before.
+        policy: a module that reads ``"observation"`` and writes ``"action"``, or a controller,
+            whose deadline and fallback then count. If it compiles, call it once before.
         task: a task or the name of a registered one; its world is stepped with the period.
         rate: ticks per second.
         seconds: duration of the loop.
@@ -101,6 +107,7 @@ def run_realtime(
     timed = replace(task.unpriced(), time_step=period)
     world = TaskWorldModel(timed, SimulatedWorld(timed).oracle())
     state = task.sample_start([], torch.Generator().manual_seed(seed))
+    act = _actions_of(policy)
     action = task.bounds.center
     milliseconds, missed, total, tick = [], 0, 0.0, 0
     start = clock()
@@ -108,8 +115,7 @@ def run_realtime(
         due = start + tick * period
         if (early := due - clock()) > 0:
             sleep(early)
-        data = TensorDict(observation=world.observe(state), is_init=torch.tensor([tick == 0]))
-        new_action = policy(data)["action"]
+        new_action = act(world.observe(state), tick == 0)
         took = clock() - due
         milliseconds.append(1e3 * took)
         # Whole periods since this tick, in which the world has moved on.
@@ -120,4 +126,18 @@ def run_realtime(
             total += float(reward)
         action, tick = new_action, tick + late + 1
     times = torch.tensor(milliseconds, dtype=torch.float64)
-    return RealTimeReport(rate, times, missed, total / ticks)
+    control = policy.report() if isinstance(policy, Controller) else None
+    return RealTimeReport(rate, times, missed, total / ticks, control)
+
+
+def _actions_of(policy: TensorDictModuleBase | Controller) -> Callable[[Tensor, bool], Tensor]:
+    """A function of an observation ``[o]``, and whether it is the first, to an action ``[m]``."""
+    if isinstance(policy, Controller):
+        policy.reset()
+        policy.clear_report()
+        return lambda observation, first: torch.from_numpy(policy.step(observation))
+
+    def act(observation: Tensor, first: bool) -> Tensor:
+        return policy(TensorDict(observation=observation, is_init=torch.tensor([first])))["action"]
+
+    return act

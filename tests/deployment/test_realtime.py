@@ -13,7 +13,7 @@ from lopsided import LOPSIDED
 from tensordict.nn import TensorDictModule
 
 from phihp_torchrl import get_task, save_agent
-from phihp_torchrl.deployment import run_realtime
+from phihp_torchrl.deployment import Controller, run_realtime
 
 from .agent_parts import make_agent
 
@@ -77,6 +77,21 @@ def test_the_world_does_not_wait(task):
     )  # fmt: skip
     middle = task.bounds.center.item()
     assert steps == [middle, middle, 1.0, 1.0, 1.0], "the first two ticks had no action yet"
+
+
+def test_a_controller_in_the_loop_says_who_acted():
+    time = FakeTime([0.01] * 5)
+    control = Controller(
+        time.policy(), "pendulum", accept=lambda o, a: abs(o[2]) > 0.0, fallback="zero"
+    )
+    options = {"clock": time.clock, "sleep": time.sleep}
+    report = run_realtime(control, "pendulum", rate=10, seconds=0.5, seed=0, **options)
+    assert report.control.steps == 5
+    assert report.control.overruled == 0
+    control._accept = lambda o, a: False
+    time.durations = iter([0.01] * 5)
+    report = run_realtime(control, "pendulum", rate=10, seconds=0.5, seed=0, **options)
+    assert report.control.reasons == {"refused": 5}
 
 
 def test_the_same_seed_starts_in_the_same_state():

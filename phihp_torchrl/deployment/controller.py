@@ -1,0 +1,270 @@
+"""An agent in a real loop: observation in, action out, with somebody who takes over."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from threading import RLock
+from typing import Any
+
+import torch
+from numpy.typing import ArrayLike, NDArray
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.deployment.control_report import ControlReport, Tally
+from phihp_torchrl.deployment.deadline import DeadlineWorker
+from phihp_torchrl.deployment.fallback import Fallback, FallbackChain
+from phihp_torchrl.deployment.observer import VelocityObserver
+from phihp_torchrl.deployment.safety import Checks, Safety
+from phihp_torchrl.deployment.under_way import UnderWay
+from phihp_torchrl.tasks import Task, find_task
+
+_log = logging.getLogger(__name__)
+
+Accept = Callable[[NDArray[Any], NDArray[Any]], bool]
+"""Whether an action ``[m]`` may be sent for an observation ``[o]``."""
+
+
+class Controller:
+    """An agent in a real loop, with everything that it carries from step to step.
+
+    :meth:`step` turns one measured observation into one action, and always returns an action that
+    is finite, in bounds and within the limits of :class:`~phihp_torchrl.deployment.Safety`. Where
+    the observation or the agent's action is not fit to be used, or the agent is late, another
+    controller takes over for this step. Each such step is counted with its reason.
+
+    The controller keeps the commands that are under way in the task's actuator, as they were sent
+    and not as the agent wanted them, so that an agent that was overruled still knows what acts.
+
+    Args:
+        agent: an :class:`~phihp_torchrl.Agent`, planning or not, compiled or not; an exported one
+            (:func:`~phihp_torchrl.deployment.load_exported`); or any module that reads
+            ``"observation"`` and writes ``"action"``.
+        task: the task or its name. Defaults to the agent's.
+        safety: the limits.
+        fallback: who takes over, in this order: ``"actor"`` (the agent's, without a plan),
+            ``"hold"`` (the last action, for a while), ``"zero"``, or a function of the observation
+            ``[o]`` as it was measured that returns an action ``[m]``, or ``None`` to pass. The last
+            resort is always rest. Defaults to the actor, if the agent plans and has one, and then
+            to the last action.
+        accept: a check of your own, of observation and action; false refuses the action.
+        observer: completes states whose velocities are not measured; :meth:`step` is then given
+            physical states ``[n]`` with NaN for what is not measured.
+        clock: a function that returns the time in seconds; timestamps are of this clock.
+
+    Raises:
+        ConfigError: for limits or a fallback that do not fit the agent and its task.
+
+    Examples:
+        >>> from phihp_torchrl import Agent, get_task
+        >>> from phihp_torchrl.agents import Actor
+        >>> task = get_task("pendulum")
+        >>> controller = Controller(Agent(task, actor=Actor(task)), fallback="zero")
+        >>> controller.step([1.0, 0.0, 0.0]).shape
+        (1,)
+        >>> controller.step([1.0, 0.0, float("nan")])  # a sensor that has failed
+        array([0.], dtype=float32)
+        >>> report = controller.report()
+        >>> report.steps, dict(report.reasons)
+        (2, {'observation': 1})
+    """
+
+    def __init__(
+        self,
+        agent: TensorDictModuleBase,
+        task: str | Task | None = None,
+        *,
+        safety: Safety | None = None,
+        fallback: Fallback | Sequence[Fallback] | None = None,
+        accept: Accept | None = None,
+        observer: VelocityObserver | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        given = getattr(agent, "task", None) if task is None else task
+        if given is None:
+            raise ConfigError("task", "expected one, since the agent does not say its own.")
+        self.agent, self.task = agent, find_task(given)
+        self.safety = safety or Safety()
+        self.observer = observer
+        self._accept, self._clock = accept, clock
+        self._checks = Checks(self.task, self.safety)
+        self._chain = FallbackChain(agent, self.task, self._checks, fallback)
+        self._memory = UnderWay(self.task) if self.task.register_count else None
+        self._worker = DeadlineWorker()
+        self._lock = RLock()
+        like = next(agent.parameters(), torch.empty(0))
+        self._like = torch.empty(0, dtype=torch.float32, device=like.device)
+        self._cuda = [like.device] if like.is_cuda else []
+        self._tally = Tally()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what is carried from step to step, at the start of an episode."""
+        with self._lock:
+            self._starts = True
+            self._stamp: float | None = None
+            self._last = self._checks.rest
+            self._chain.reset()
+            for part in (self._memory, self.observer):
+                if part is not None:
+                    part.reset()
+
+    def step(
+        self, observation: ArrayLike | Tensor, *, timestamp: float | None = None, **inputs: Any
+    ) -> NDArray[Any]:
+        """Return the action to send now, float32 ``[m]``, in physical units.
+
+        Args:
+            observation: what was measured, ``[o]``: the observation of the system alone, or with
+                what is under way; for a controller with an observer, a state ``[n]``.
+            timestamp: when it was measured, in seconds of ``clock``.
+            inputs: further entries that the agent reads, by key.
+
+        Raises:
+            ValueError: for an observation of the wrong size.
+        """
+        with self._lock, torch.no_grad():
+            started = self._clock()
+            measured = torch.as_tensor(observation, dtype=torch.float32).detach().cpu()
+            seen = self._complete(measured)
+            reason = self._fault(seen, timestamp, started)
+            data = self._data(seen, inputs)
+            action = None
+            if reason is None:
+                action, reason = self._ask(data, seen, started)
+            if action is None or reason is not None:
+                usable = reason not in ("observation", "implausible", "stale")
+                action, name = self._chain.act(measured, data if usable else None, self._last)
+                self._tally.overruled(str(reason), name)
+            else:
+                action = self.task.clip_action(action)  # what rounding put outside
+                self._tally.acted()
+                self._chain.reset()
+            self._sent(action)
+            self._tally.took(1e3 * (self._clock() - started))
+            return action.numpy().copy()
+
+    def warm_up(self, calls: int = 20) -> dict[str, float]:
+        """Act a few times on states of the task without a deadline, so that nothing is new later.
+
+        What compiles, compiles now. A warning is logged if the agent alone takes longer than the
+        deadline.
+
+        Returns:
+            Quantiles of the time of an action after the first, in milliseconds.
+        """
+        with self._lock, torch.no_grad(), torch.random.fork_rng(devices=self._cuda):
+            states = (self.task.coverage or self.task.reset).sample([calls + 1])
+            times = []
+            for seen in self.task.observe(self.task.at_rest(states)):
+                start = self._clock()
+                starts = torch.ones(1, dtype=torch.bool, device=self._like.device)
+                data = TensorDict(observation=seen.to(self._like), is_init=starts)
+                self._run_agent(data, None)
+                times.append(1e3 * (self._clock() - start))
+                self._chain.warm_up(data)
+            self.reset()
+        later = torch.tensor(times[1:] or times, dtype=torch.float64)
+        found = {f"p{round(100 * q)}_ms": later.quantile(q).item() for q in (0.5, 0.99)}
+        deadline = self.safety.deadline
+        if deadline is not None and found["p99_ms"] > 1e3 * deadline:
+            _log.warning(
+                "An action takes %.1f ms (99th percentile), and the deadline is %.1f ms: the "
+                "fallback will often act. Compile the plan, plan on a smaller budget, or act by "
+                "the actor alone.",
+                found["p99_ms"],
+                1e3 * deadline,
+            )
+        return found
+
+    def report(self) -> ControlReport:
+        """What has happened since the controller was made, or :meth:`clear_report`."""
+        with self._lock:
+            return self._tally.report()
+
+    def clear_report(self) -> None:
+        """Count from zero again."""
+        with self._lock:
+            self._tally = Tally()
+
+    def close(self) -> None:
+        """End the thread in which the agent acts; the controller can be used again."""
+        self._worker.close()
+
+    # One step, in its order.
+
+    def _complete(self, measured: Tensor) -> Tensor:
+        """The observation ``[o]`` for what was measured."""
+        system = self.task.system
+        if self.observer is not None:
+            sizes = {system.state_dim}
+        else:
+            sizes = {system.observation_dim, self.task.observation_dim}
+        if measured.ndim != 1 or len(measured) not in sizes:
+            raise ValueError(
+                f"observation: expected shape [{' or '.join(map(str, sorted(sizes)))}], "
+                f"got {list(measured.shape)}."
+            )
+        return measured if self.observer is None else system.observe(self.observer.update(measured))
+
+    def _fault(self, seen: Tensor, timestamp: float | None, now: float) -> str | None:
+        if timestamp is not None:
+            last, self._stamp = self._stamp, timestamp
+            limit = self.safety.max_age
+            if (limit is not None and now - timestamp > limit) or timestamp == last:
+                return "stale"
+        return self._checks.observation(seen)
+
+    def _data(self, seen: Tensor, inputs: dict[str, Any]) -> TensorDict:
+        like = self._like
+        entries = {key: torch.as_tensor(value).to(like) for key, value in inputs.items()}
+        data = TensorDict(observation=seen.to(like), **entries)
+        self._remembers = self._memory is not None and self._memory.is_asked(data)
+        if self._memory is not None and self._remembers:
+            data = self._memory.extend(data)
+        return data.set("is_init", torch.tensor([self._starts], device=like.device))
+
+    def _ask(
+        self, data: TensorDict, seen: Tensor, started: float
+    ) -> tuple[Tensor | None, str | None]:
+        """The agent's action and why it must not be used, one of which is ``None``."""
+        deadline = self.safety.deadline
+        left = None if deadline is None else max(0.0, deadline - (self._clock() - started))
+        try:
+            action = self._run_agent(data, left)
+        except TimeoutError:
+            return None, "late"
+        except Exception:
+            _log.exception("The agent failed; the fallback acts.")
+            return None, "error"
+        self._starts = False
+        if (reason := self._checks.action(action, self._last)) is not None:
+            return None, reason
+        if self._accept is not None and not self._accept(seen.numpy(), action.numpy()):
+            return None, "refused"
+        return action, None
+
+    def _run_agent(self, data: TensorDict, timeout: float | None) -> Tensor:
+        act = partial(_act, self.agent, data.clone())
+        if self.safety.deadline is None:
+            return act()
+        return self._worker.run(act, timeout)
+
+    def _sent(self, action: Tensor) -> None:
+        self._last = action
+        if self._memory is not None and self._remembers:
+            self._memory.record(action.to(self._like))
+        if self.observer is not None:
+            self.observer.acted(action)
+
+
+@torch.no_grad()
+def _act(agent: TensorDictModuleBase, data: TensorDict) -> Tensor:
+    if data["is_init"].item() and hasattr(agent, "reset"):
+        agent.reset()  # in the agent's own thread
+    return agent(data)["action"].detach().cpu()

@@ -1,0 +1,152 @@
+"""What a controller refuses: observations that cannot be, and actions that must not be sent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.config import ConfigError, check_count, check_positive
+from phihp_torchrl.tasks import Task
+from phihp_torchrl.worlds import read_guards
+
+REASONS = {
+    "observation": "an observation that is not finite",
+    "implausible": "an observation outside the plausible ranges, or a cosine without its sine",
+    "stale": "a sample that is too old, or the one before once more",
+    "late": "no plan by the deadline",
+    "error": "a plan that raised an exception",
+    "not_finite": "an action that is not finite",
+    "bounds": "an action outside the task's bounds",
+    "rate": "an action too far from the one before",
+    "refused": "an action that the caller's own check refused",
+}
+"""Why another controller takes over, by the name under which it is counted."""
+
+_ROUNDING = 1e-4
+"""How far, in half-ranges, an action may be outside its bounds, where rounding put it."""
+
+
+@dataclass(frozen=True)
+class Safety:
+    """The limits beyond which a :class:`~phihp_torchrl.deployment.Controller` is overruled.
+
+    Args:
+        deadline: seconds from the call of ``step`` within which the agent must have acted; ``None``
+            to wait for it for ever.
+        plausible: by name of a state, the largest ``|value|``, or the lowest and the highest value,
+            that a sensor can report. States without an entry may have any finite value.
+        mismatch: how much the cosine and the sine of an angle may contradict each other: the
+            largest difference of an observation to the one of the state read from it. ``None`` for
+            any.
+        max_age: seconds after which a sample is too old to act upon; ``None`` for any age.
+        max_change: the largest change of each action from one step to the next, in units of the
+            action: one number, or one for each. ``None`` for any.
+        hold_steps: steps in a row for which the last action may be held before the motor is left
+            at rest.
+
+    Raises:
+        ConfigError: for a number that is not positive.
+
+    Examples:
+        >>> Safety(deadline=0.015, plausible={"x": 2.0}).hold_steps
+        5
+    """
+
+    deadline: float | None = None
+    plausible: Mapping[str, float | tuple[float, float]] = field(default_factory=dict, hash=False)
+    mismatch: float | None = 0.05
+    max_age: float | None = None
+    max_change: float | tuple[float, ...] | None = None
+    hold_steps: int = 5
+
+    def __post_init__(self) -> None:
+        given = [n for n in ("deadline", "mismatch", "max_age") if getattr(self, n) is not None]
+        check_positive(self, *given)
+        check_count(self, "hold_steps", least=0)
+        if self.max_change is not None:
+            change = self.max_change
+            changes = (change,) if isinstance(change, (int, float)) else change
+            if not all(0 < change < math.inf for change in changes):
+                raise ConfigError(
+                    "max_change", f"expected positive numbers, got {self.max_change!r}."
+                )
+
+
+class Checks:
+    """The limits of a :class:`Safety` for one task, as functions that name what is wrong.
+
+    Args:
+        task: the task.
+        safety: the limits.
+
+    Raises:
+        ConfigError: for limits that do not fit the task.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> checks = Checks(get_task("pendulum"), Safety(max_change=0.5))
+        >>> checks.observation(torch.tensor([1.0, 0.0, 0.0]))
+        >>> checks.observation(torch.tensor([1.0, 1.0, 0.0]))
+        'implausible'
+        >>> checks.action(torch.tensor([1.0]), torch.tensor([0.0]))
+        'rate'
+    """
+
+    def __init__(self, task: Task, safety: Safety) -> None:
+        self.task, self.safety = task, safety
+        try:
+            limits = read_guards(task, safety.plausible)
+        except ConfigError as error:
+            raise ConfigError(error.key.replace("guards", "plausible", 1), error.reason) from error
+        names = task.system.state_names
+        self._limited = [names.index(name) for name in limits]
+        self._low = torch.tensor([low for low, _ in limits.values()])
+        self._high = torch.tensor([high for _, high in limits.values()])
+        self._bounds = task.bounds
+        self.rest = task.clip_action(torch.zeros(task.action_dim))
+        change = safety.max_change
+        if isinstance(change, (tuple, list)) and len(change) != task.action_dim:
+            raise ConfigError(
+                "max_change",
+                f"expected one number, or one for each of {task.system.action_names}, "
+                f"got {change!r}.",
+            )
+        self.change = None if change is None else torch.tensor(change).expand(task.action_dim)
+
+    def observation(self, observation: Tensor) -> str | None:
+        """Why an observation ``[o]`` on the CPU cannot be acted upon, or ``None``."""
+        if not observation.isfinite().all():
+            return "observation"
+        seen = observation[: self.task.system.observation_dim]
+        if not self._limited and self.safety.mismatch is None:
+            return None
+        state = self.task.system.locate(seen)
+        if self.safety.mismatch is not None:
+            off = (self.task.system.observe(state) - seen).abs()
+            if (off > self.safety.mismatch * (1.0 + seen.abs())).any():
+                return "implausible"
+        limited = state[self._limited]
+        outside = (limited < self._low) | (limited > self._high)
+        return "implausible" if outside.any() else None
+
+    def action(self, action: Tensor, last: Tensor) -> str | None:
+        """Why an action ``[m]`` on the CPU must not follow the one before, or ``None``."""
+        if not action.isfinite().all():
+            return "not_finite"
+        low, high, _, scale = self._bounds
+        if ((action < low - _ROUNDING * scale) | (action > high + _ROUNDING * scale)).any():
+            return "bounds"
+        too_far = self.change is not None and (
+            (action - last).abs() > self.change + _ROUNDING * scale
+        )
+        return "rate" if too_far is not False and too_far.any() else None
+
+    def towards_rest(self, last: Tensor) -> Tensor:
+        """The action ``[m]`` nearest to rest (zero, in bounds) that may follow the last one."""
+        if self.change is None:
+            return self.rest
+        return last + (self.rest - last).clamp(-self.change, self.change)
