@@ -16,7 +16,8 @@ from phihp_torchrl.agents.networks import (
 from phihp_torchrl.agents.refit import CriticRefit, Refit, RefitConfig
 from phihp_torchrl.agents.replay import FlatReplay
 from phihp_torchrl.agents.scales import Scales, measure_scales, scaled, visited_states
-from phihp_torchrl.agents.td3 import TD3Config, TD3Update, learning_rate_scale, make_td3_loss
+from phihp_torchrl.agents.td3 import TD3Config, TD3Update, make_td3_loss
+from phihp_torchrl.agents.update import ActorCriticUpdate, learning_rate_scale
 
 __all__ = [
     "Actor",

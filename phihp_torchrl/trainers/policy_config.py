@@ -17,6 +17,7 @@ from phihp_torchrl.config import (
     check_share,
 )
 from phihp_torchrl.imagination import StartConfig
+from phihp_torchrl.trainers.learners import LEARNERS
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class PolicyConfig:
     """Settings of phase 2, which trains actor and critics in imagination (paper, section 4.2).
 
     Args:
+        method: the way to learn, td3 or another registered one.
         updates: total number of critic updates.
         batch_size: transitions in an update.
         num_worlds: number of imagined worlds that are stepped at once.
@@ -62,6 +64,7 @@ class PolicyConfig:
         phihp_torchrl.config.ConfigError: random_fraction: expected a number in [0, 1], got 1.5.
     """
 
+    method: str = "td3"
     updates: int = 8000
     batch_size: int = 128
     num_worlds: int = 64
@@ -97,6 +100,7 @@ class PolicyConfig:
             "evaluation_interval",
             "evaluation_episodes",
         )
+        check_choice(self, "method", LEARNERS)
         check_choice(self, "scales", ("auto", "none"))
         check_share(self, "random_fraction", "decay")
         check_count(self, "random_steps", "real_evaluation_episodes", least=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -152,6 +153,7 @@ class RealTD3Trainer(TD3Trainer):
             )
         super().__init__(model, config, seed=seed, compile=compile)
         self.config = config
+        self.seconds = 0.0
         self.world = Rollouts(model, act, task.max_steps, compile=compile)
         given = 0 if transitions is None else len(transitions.reward)
         capacity = min(config.replay_capacity, given + config.real_steps)
@@ -215,6 +217,15 @@ class RealTD3Trainer(TD3Trainer):
         """Returns ``[evaluation_episodes]`` of the noise-free actor in the real world."""
         states, steps = self._evaluation_states, self.task.max_steps
         return self.world.returns(self.update.networks.actor, states, steps).total
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a resumed run needs, tensors and numbers only."""
+        return {**super().state_dict(), "seconds": self.seconds}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a :meth:`state_dict`."""
+        super().load_state_dict(state)
+        self.seconds = state["seconds"]
 
     def parts(self) -> dict[str, Any]:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""

@@ -40,7 +40,6 @@ class TD3Trainer:
         self.loss = make_td3_loss(world_model, td3)
         self.update = TD3Update(self.loss, world_model, td3, compile=compile)
         self.updates = 0
-        self.seconds = 0.0
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
@@ -49,7 +48,6 @@ class TD3Trainer:
             "replay": self.replay.state_dict(),
             "worlds": list(self.worlds),
             "updates": self.updates,
-            "seconds": self.seconds,
             "generator": self.generator.get_state(),
         }
 
@@ -59,7 +57,6 @@ class TD3Trainer:
         self.replay.load_state_dict(state["replay"])
         self.worlds = Worlds(*state["worlds"])
         self.updates = state["updates"]
-        self.seconds = state["seconds"]
         self.generator.set_state(state["generator"])
 
     def _act(
