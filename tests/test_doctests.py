@@ -18,11 +18,11 @@ from phihp_torchrl.dynamics import PRIORS
 from phihp_torchrl.integrators import INTEGRATORS
 from phihp_torchrl.planners import PLANNERS
 from phihp_torchrl.tasks.registry import _TASKS
-from phihp_torchrl.trainers import PHASES
+from phihp_torchrl.trainers import LEARNERS, PHASES
 from phihp_torchrl.worlds import WORLDS
 from phihp_torchrl.worlds.simulated.plant import _PLANTS
 
-REGISTRIES = (METHODS, AGENT_KINDS, PRIORS, INTEGRATORS, PLANNERS, _TASKS, PHASES, WORLDS)
+REGISTRIES = (METHODS, AGENT_KINDS, PRIORS, INTEGRATORS, PLANNERS, _TASKS, PHASES, LEARNERS, WORLDS)
 ROOT = Path(__file__).parents[1]
 
 

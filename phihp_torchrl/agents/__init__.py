@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.agents.analytic_update import AnalyticConfig, AnalyticUpdate, Draws
 from phihp_torchrl.agents.equations import Layers, act, q_values, soft_update_
 from phihp_torchrl.agents.networks import (
     Actor,
@@ -16,10 +17,13 @@ from phihp_torchrl.agents.networks import (
 from phihp_torchrl.agents.refit import CriticRefit, Refit, RefitConfig
 from phihp_torchrl.agents.replay import FlatReplay
 from phihp_torchrl.agents.scales import Scales, measure_scales, scaled, visited_states
-from phihp_torchrl.agents.td3 import TD3Config, TD3Update, learning_rate_scale, make_td3_loss
+from phihp_torchrl.agents.td3 import TD3Config, TD3Update, make_td3_loss
+from phihp_torchrl.agents.update import ActorCriticUpdate, learning_rate_scale
 
 __all__ = [
     "Actor",
+    "AnalyticConfig",
+    "AnalyticUpdate",
     "QNetwork",
     "RefitConfig",
     "TD3Config",

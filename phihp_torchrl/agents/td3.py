@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.objectives import SoftUpdate, TD3Loss, ValueEstimators
 
 from phihp_torchrl.agents.equations import (
-    Layers,
     actor_loss,
     adam_,
     adam_rates,
@@ -21,6 +18,7 @@ from phihp_torchrl.agents.equations import (
     td3_target,
 )
 from phihp_torchrl.agents.networks import make_actor, make_qvalue
+from phihp_torchrl.agents.update import ActorCriticUpdate, Networks
 from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.config import (
     Discount,
@@ -39,19 +37,6 @@ from phihp_torchrl.imagination import Batch
 from phihp_torchrl.tasks import ActionBounds
 
 _logger = logging.getLogger(__name__)
-
-
-class Networks(NamedTuple):
-    """The tensors that a step changes, each group a list ``[weight, bias, …]``."""
-
-    actor: list[Tensor]
-    critics: list[Tensor]
-    target_actor: list[Tensor]
-    target_critics: list[Tensor]
-    actor_means: list[Tensor]
-    actor_squares: list[Tensor]
-    critic_means: list[Tensor]
-    critic_squares: list[Tensor]
 
 
 @dataclass(frozen=True)
@@ -121,7 +106,7 @@ def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
         >>> task = get_task("pendulum")
         >>> model = TaskWorldModel(task, HybridDynamics.hybrid(task))
         >>> loss = make_td3_loss(model, TD3Config(actor_hidden_sizes=(8,)))
-        >>> [tuple(layer.shape) for layer in layers(loss.actor_network_params)]
+        >>> [tuple(layer.shape) for layer in TD3Update(loss, model, TD3Config()).actor]
         [(8, 3), (8,), (1, 8), (1,)]
     """
     task = world_model.task
@@ -141,21 +126,7 @@ def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
     return loss
 
 
-def learning_rate_scale(left: float, decay: float) -> float:
-    """Return the factor on learning rates: 1 at first, falling to a twentieth at the end.
-
-    Args:
-        left: remaining share of the training, from 1 to 0.
-        decay: share of the training, at its end, in which the factor falls; 0 for never.
-
-    Examples:
-        >>> [learning_rate_scale(left, decay=0.5) for left in (0.9, 0.25, 0.0)]
-        [1.0, 0.5, 0.05]
-    """
-    return 1.0 if decay == 0 else max(0.05, min(1.0, left / decay))
-
-
-class TD3Update(nn.Module):
+class TD3Update(ActorCriticUpdate):
     """One step of TD3 as one graph: ``policy_delay`` critic updates, an actor update, soft updates.
 
     The step changes the parameters and targets of a :class:`~torchrl.objectives.TD3Loss` in place,
@@ -183,8 +154,6 @@ class TD3Update(nn.Module):
         ['loss_actor', 'loss_qvalue']
     """
 
-    steps: Tensor
-
     def __init__(
         self,
         loss: TD3Loss,
@@ -193,68 +162,12 @@ class TD3Update(nn.Module):
         *,
         compile: bool = False,
     ) -> None:
-        super().__init__()
-        self.loss = loss
-        self.world_model = world_model
+        super().__init__(loss, world_model)
         self.config = config = resolve_seconds(config, world_model.task.time_step)
-        self._networks: Networks | None = None
-        self._bounds: ActionBounds | None = None
-        for name, group in (("actor", self.actor), ("critics", self.critics)):
-            for i, layer in enumerate(group):
-                self.register_buffer(f"{name}_mean_{i}", torch.zeros_like(layer))
-                self.register_buffer(f"{name}_square_{i}", torch.zeros_like(layer))
-        self.register_buffer("steps", torch.zeros((), dtype=torch.float64))
         if compile and config.value_expansion > 1 and not world_model.compiles:
             _logger.warning("TD3 is not compiled: the model's integrator does not compile.")
             compile = False
         self._compiled_step = compile_graph(self._step, enabled=compile)
-
-    @property
-    def actor(self) -> list[Tensor]:
-        """The layers of the actor, which share memory with the loss."""
-        return layers(self.loss.actor_network_params)
-
-    @property
-    def critics(self) -> list[Tensor]:
-        """The stacked layers of the critics, which share memory with the loss."""
-        return layers(self.loss.qvalue_network_params)
-
-    @property
-    def networks(self) -> Networks:
-        """Layers, targets and moments; more than fifty tensors, so they are looked up once."""
-        if self._networks is None:
-            self._networks = Networks(
-                self.actor,
-                self.critics,
-                layers(self.loss.target_actor_network_params),
-                layers(self.loss.target_qvalue_network_params),
-                *(
-                    [getattr(self, f"{name}_{moment}_{i}") for i in range(len(group))]
-                    for name, group in (("actor", self.actor), ("critics", self.critics))
-                    for moment in ("mean", "square")
-                ),
-            )
-        return self._networks
-
-    @torch.no_grad()
-    def restart(self, actor: Layers, critics: Layers) -> None:
-        """Continue from these layers, also as targets; the moments of Adam are not changed."""
-        nets = self.networks
-        for mine, given in (
-            (nets.actor, actor),
-            (nets.target_actor, actor),
-            (nets.critics, critics),
-            (nets.target_critics, critics),
-        ):
-            for layer, value in zip(mine, given, strict=True):
-                layer.copy_(value)
-
-    def _apply(self, *args: Any, **kwargs: Any) -> TD3Update:
-        self._networks = self._bounds = None  # the tensors may have moved to another device
-        return super()._apply(*args, **kwargs)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_networks": None, "_bounds": None}  # not for a copy
 
     @torch.no_grad()
     def forward(
@@ -283,9 +196,7 @@ class TD3Update(nn.Module):
                 f"batch: expected a multiple of policy_delay = {config.policy_delay} rows, "
                 f"got {rows}."
             )
-        if self._bounds is None:  # computed once, since that takes longer than to use them
-            self._bounds = ActionBounds.from_limits(self.loss.min_action, self.loss.max_action)
-        bounds = self._bounds
+        bounds = self.bounds
         noise = torch.randn(batch.action.shape, generator=generator, device=bounds.low.device)
         clip = config.target_noise_clip
         updates = torch.arange(1, config.policy_delay + 1, device=bounds.low.device)
@@ -340,10 +251,3 @@ class TD3Update(nn.Module):
         soft_update_(nets.target_actor, nets.actor, config.tau)
         soft_update_(nets.target_critics, nets.critics, config.tau)
         return loss_qvalue, loss_actor
-
-
-def layers(params: TensorDictBase) -> list[Tensor]:
-    """Return weights and biases of parameters of TD3Loss, detached, sharing their memory."""
-    mlp = params["module", "mlp"]
-    names = sorted(mlp.keys(), key=int)
-    return [mlp[name, part].detach() for name in names for part in ("weight", "bias")]

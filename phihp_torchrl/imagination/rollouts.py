@@ -185,7 +185,8 @@ class Rollouts:
         if compile and not world_model.compiles:
             _logger.warning("Rollouts are not compiled: the model's integrator does not compile.")
             compile = False
-        self.bounds = world_model.task.bounds.to(device)
+        self.task = world_model.task
+        self.bounds = self.task.bounds.to(device)
         self.max_age = max_age
         self._step_worlds = compile_graph(
             partial(step_worlds, world_model, policy), enabled=compile

@@ -6,6 +6,15 @@ from phihp_torchrl.trainers.collect import CollectConfig, Policy, planning_polic
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.evaluate import EvaluateConfig, EvaluatePhase
 from phihp_torchrl.trainers.exploration import Exploration, ExplorationConfig
+from phihp_torchrl.trainers.imagined_analytic import ImaginedAnalytic
+from phihp_torchrl.trainers.imagined_td3 import ImaginedTD3
+from phihp_torchrl.trainers.learners import (
+    LEARNERS,
+    Imagination,
+    Learner,
+    LearnerKind,
+    register_learner,
+)
 from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
 from phihp_torchrl.trainers.model import ModelTrainer
 from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
@@ -13,6 +22,7 @@ from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_pha
 from phihp_torchrl.trainers.plugins import import_plugins
 from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.policy_config import PolicyConfig
+from phihp_torchrl.trainers.policy_phase import build_policy
 from phihp_torchrl.trainers.record import record
 from phihp_torchrl.trainers.results import read_result
 from phihp_torchrl.trainers.run import RunResult, run
@@ -42,6 +52,7 @@ __all__ = [
     "RunConfig",
     "RunResult",
     "read_run_config",
+    "register_learner",
     "register_phase",
     "run",
 ]

@@ -1,8 +1,7 @@
-"""Phase 2: TD3 in imagination (paper, section 4.2)."""
+"""Phase 2: actor and critics learn in imagination (paper, section 4.2)."""
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections.abc import Mapping
@@ -13,38 +12,33 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 
 from phihp_torchrl.agents import (
+    ActorCriticUpdate,
     CriticRefit,
-    FlatReplay,
-    Scales,
     act,
     copy_actor,
     copy_twin_qvalue,
-    learning_rate_scale,
-    measure_scales,
     scaled,
-    visited_states,
 )
-from phihp_torchrl.config import ConfigError, resolve_seconds
-from phihp_torchrl.dynamics import (
-    HybridDynamics,
-    PhysicsPrior,
-    TaskWorldModel,
-    draw_shifts,
-    per_life,
-)
-from phihp_torchrl.imagination import Rollouts, Worlds, make_start_states
+from phihp_torchrl.config import resolve_seconds
+from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel, per_life
+from phihp_torchrl.imagination import Rollouts, make_start_states
 from phihp_torchrl.tasks import Task
-from phihp_torchrl.trainers.context import Context
-from phihp_torchrl.trainers.phases import Phase, register_phase
+from phihp_torchrl.trainers.drawn_constants import draw_constants
+from phihp_torchrl.trainers.learners import LEARNERS, Imagination
 from phihp_torchrl.trainers.policy_config import PolicyConfig
-from phihp_torchrl.trainers.td3_base import TD3Trainer
+from phihp_torchrl.trainers.policy_evaluation import ActorEvaluation
+from phihp_torchrl.trainers.policy_scales import check_scales, training_scales
 from phihp_torchrl.worlds import World
 
-_log = logging.getLogger(__name__)
+# Losses are in these powers of the reward's unit, other metrics have none.
+_POWERS = {"loss_actor": 1, "loss_qvalue": 2, "return_range": 1}
 
 
-class PolicyTrainer(TD3Trainer):
-    """Phase 2: trains actor and critics by TD3 in imagination (paper, section 4.2).
+class PolicyTrainer:
+    """Phase 2: trains actor and critics in imagination (paper, section 4.2).
+
+    ``config.method`` is the way to learn: TD3, or another that :func:`register_learner` has added.
+    Everything else is the same for all of them.
 
     After every ``evaluation_interval`` updates the noise-free actor is evaluated in the model, from
     the task's reset box, and the best actor so far is kept with its critics. Returns in a simulated
@@ -70,7 +64,7 @@ class PolicyTrainer(TD3Trainer):
         seed: seed of all random numbers but the initial weights of the networks, which come from
             torch's global generator.
         data_states: states of real transitions ``[N, n]``, for ``start.data`` > 0.
-        compile: whether to compile the TD3 step, imagination, and the fit of the critics.
+        compile: whether to compile updates, imagination, and the fit of the critics.
         covariance: covariance of the model's learned constants, for ``config.draw_constants``
             without ``config.constants_std``.
 
@@ -108,35 +102,45 @@ class PolicyTrainer(TD3Trainer):
     ) -> None:
         self.task = task
         self.config = config = resolve_seconds(config, task.time_step)
-        self.shifts = _draw(dynamics, config, covariance, seed)
-        self.start_states = make_start_states(task, config.start, states=data_states)
+        self.shifts = draw_constants(dynamics, config, covariance, seed)
+        start_states = make_start_states(task, config.start, states=data_states)
         model = TaskWorldModel(task, per_life(dynamics, self.shifts))
-        self.scales = self._measure(model, seed)
+        self.scales = training_scales(model, start_states, config, seed)
         self.world_model = scaled(model, self.scales)
-        super().__init__(self.world_model, config.td3, seed=seed, compile=compile)
         self.rollouts = Rollouts(self.world_model, act, self.max_age, compile=compile)
         self.refit = CriticRefit(
             self.world_model, self.rollouts, config.refit, config.td3.gamma, compile=compile
         )
-        self.replay = FlatReplay(config.replay_capacity, task.state_dim, task.action_dim)
-        self.worlds = self._new_worlds()
-        self.best = [layer.clone() for layer in (*self.update.actor, *self.update.critics)]
+        self.learner = LEARNERS.find(config.method).build(
+            Imagination(self.world_model, self.rollouts, start_states, config, seed, compile)
+        )
+        self.best = [layer.clone() for layer in self._layers()]
         self.best_return = -math.inf
-        self._evaluation_states = task.sample_start([config.evaluation_episodes], self.generator)
-        truth = None if world is None else world.model()
-        self._real = None
-        if truth is not None:
-            world_model = scaled(truth, self.scales)
-            self._real = Rollouts(world_model, act, self.max_age, compile=compile)
-        # The world's episodes have a generator of their own: the log has no part in the training.
-        self._world_states = task.sample_start(
-            [config.real_evaluation_episodes], torch.Generator().manual_seed(seed)
+        self.seconds = 0.0
+        self.evaluation = ActorEvaluation(
+            self.rollouts,
+            self.scales,
+            config,
+            world=world,
+            seed=seed,
+            generator=self.learner.generator,
+            compile=compile,
         )
 
     @property
     def max_age(self) -> int:
         """Largest number of steps in an imagined episode."""
         return self.config.max_age or self.task.max_steps
+
+    @property
+    def update(self) -> ActorCriticUpdate:
+        """Actor and critics, which the learner changes."""
+        return self.learner.update
+
+    @property
+    def updates(self) -> int:
+        """Critic updates so far."""
+        return self.learner.updates
 
     @property
     def progress(self) -> tuple[int, int]:
@@ -154,34 +158,26 @@ class PolicyTrainer(TD3Trainer):
         """Train for one evaluation interval and evaluate; returns what to log."""
         start = time.perf_counter()
         config = self.config
-        until = min(self.updates + config.evaluation_interval, config.updates)
-        losses: dict[str, Tensor] = {}
-        while self.updates < until:
-            round_end = config.chunk_steps * config.updates_per_step
-            if self.updates % round_end == 0:
-                self._imagine_chunk()
-            for _ in range(min(round_end - self.updates % round_end, until - self.updates)):
-                if self.updates % config.td3.policy_delay == 0:
-                    left = 1.0 - self.updates / config.updates
-                    scale = learning_rate_scale(left, config.decay)
-                    losses = self._learn(config.batch_size, scale)
-                self.updates += 1
-        imagined = self._play(self.rollouts, self._evaluation_states)
+        found = self.learner.learn(min(self.updates + config.evaluation_interval, config.updates))
+        imagined = self.evaluation.imagined(self.update.networks.actor)
         # Of equal ones the later, which has learned more; none that left the finite numbers.
         if -math.inf < imagined >= self.best_return:
             self.best_return = imagined
             self._keep(self._layers())
+        unit = self.scales.reward
         metrics = {
             "policy/updates": float(self.updates),
-            "policy/imagined_steps": float(self.replay.written),
+            "policy/imagined_steps": float(self.learner.imagined_steps),
             "policy/imagined_return": imagined,
             "policy/best_imagined_return": self.best_return,
-            **{f"policy/{name}": self._unit(name) * loss.item() for name, loss in losses.items()},
+            **{
+                f"policy/{name}": unit ** _POWERS.get(name, 0) * value.item()
+                for name, value in found.items()
+            },
         }
         if config.refit.is_due(self.updates, config.updates):
             metrics |= self._refit_critics()
-        if config.real_evaluation_episodes and self._real is not None:
-            metrics["policy/real_return"] = self._play(self._real, self._world_states)
+        metrics |= self.evaluation.real(self.update.networks.actor)
         self.seconds += time.perf_counter() - start
         return {**metrics, "policy/seconds": self.seconds}
 
@@ -205,12 +201,13 @@ class PolicyTrainer(TD3Trainer):
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
         return {
-            **super().state_dict(),
+            **self.learner.state_dict(),
+            "seconds": self.seconds,
             "scales": vars(self.scales).copy(),
             "best": list(self.best),
             "best_return": self.best_return,
-            "evaluation_states": self._evaluation_states,
-            "world_states": self._world_states,
+            "evaluation_states": self.evaluation.states,
+            "world_states": self.evaluation.world_states,
             **({} if self.shifts is None else {"shifts": self.shifts}),
         }
 
@@ -220,60 +217,16 @@ class PolicyTrainer(TD3Trainer):
         Raises:
             ConfigError: if that was trained in other units than those measured here.
         """
-        self._check_scales(state.get("scales"))
-        super().load_state_dict(state)
+        check_scales(self.task, self.scales, state.get("scales"))
+        self.learner.load_state_dict(state)
+        self.seconds = state["seconds"]
         for kept, layer in zip(self.best, state["best"], strict=True):
             kept.copy_(layer)
         if self.shifts is not None:
             self.shifts.copy_(state["shifts"])  # the same to the last digit on another machine
         self.best_return = state["best_return"]
-        self._evaluation_states = state["evaluation_states"]
-        self._world_states = state["world_states"]
-
-    def _measure(self, model: TaskWorldModel, seed: int) -> Scales:
-        """The units to train in; they have a generator of their own, which moves nothing else."""
-        task, config = self.task, self.config
-        if config.scales == "none":
-            size = task.observation_dim
-            return Scales(torch.zeros(size), torch.ones(size))
-        generator = torch.Generator().manual_seed(seed)
-        states = visited_states(model, self.start_states, min(self.max_age, 200), generator)
-        gamma = config.td3.gamma
-        horizon = self.max_age if gamma == 1 else min(self.max_age, 1 / (1 - gamma))
-        scales = measure_scales(model, states, horizon, generator)
-        if not scales.are_one:
-            _log.info(
-                "Networks read (observation - %s) / %s and learn rewards / %g.",
-                scales.center.tolist(),
-                scales.scale.tolist(),
-                scales.reward,
-            )
-        return scales
-
-    def _check_scales(self, saved: Mapping[str, Any] | None) -> None:
-        size = self.task.observation_dim
-        there = Scales(**saved) if saved else Scales(torch.zeros(size), torch.ones(size))
-        same = all(
-            torch.equal(torch.as_tensor(getattr(there, name)), torch.as_tensor(value))
-            for name, value in vars(self.scales).items()
-        )
-        if not same:
-            raise ConfigError(
-                "policy.scales",
-                f"expected networks trained in the units measured here, {self.scales}, got some "
-                f"trained in {there}; start phase 'policy' again, with policy.scales=none for "
-                "physical units.",
-            )
-
-    def _unit(self, name: str) -> float:
-        """The unit of a loss: critics' is squared."""
-        return self.scales.reward ** (2 if name == "loss_qvalue" else 1)
-
-    def _play(self, world: Rollouts, states: Tensor) -> float:
-        """Mean return of the noise-free actor; minus infinity where it left the finite numbers."""
-        steps = self.config.evaluation_steps or self.task.max_steps
-        score = world.returns(self.update.networks.actor, states, steps).total
-        return self.scales.reward * torch.nan_to_num(score, nan=-math.inf).mean().item()
+        self.evaluation.states = state["evaluation_states"]
+        self.evaluation.world_states = state["world_states"]
 
     def _keep(self, layers: list[Tensor]) -> None:
         for kept, layer in zip(self.best, layers, strict=True):
@@ -283,8 +236,8 @@ class PolicyTrainer(TD3Trainer):
         """Fit the best actor's critics to its returns, and go on from these."""
         count = len(self.update.networks.actor)
         actor, critics = self.best[:count], self.best[count:]
-        batch = self.replay.sample(self.config.refit.transitions, self.generator)
-        refit = self.refit(actor, critics, batch.state, batch.action, self.generator)
+        visited = self.learner.visited(self.config.refit.transitions)
+        refit = self.refit(actor, critics, *visited, self.learner.generator)
         self._keep([*actor, *refit.critics])
         self.update.restart(actor, refit.critics)
         return {
@@ -295,62 +248,3 @@ class PolicyTrainer(TD3Trainer):
 
     def _layers(self) -> list[Tensor]:
         return [*self.update.actor, *self.update.critics]
-
-    def _new_worlds(self) -> Worlds:
-        count = self.config.num_worlds
-        age = torch.randint(self.max_age, (count,), generator=self.generator)
-        return Worlds(self.start_states.sample([count], self.generator), age)
-
-    def _imagine_chunk(self) -> None:
-        config = self.config
-        while True:
-            warm = len(self.replay) >= config.random_steps
-            self._act(
-                self.rollouts,
-                self.start_states.sample([config.chunk_steps, config.num_worlds], self.generator),
-                noise=config.exploration_noise,
-                random_fraction=config.random_fraction if warm else 1.0,
-            )
-            if warm:
-                return
-
-
-def _draw(
-    dynamics: HybridDynamics, config: PolicyConfig, covariance: Tensor | None, seed: int
-) -> Tensor | None:
-    """Shifts of the constants of each imagined world, ``[worlds, learned]``, if there are any."""
-    if not config.draw_constants:
-        return None
-    prior = getattr(dynamics, "prior", None)
-    if not isinstance(prior, PhysicsPrior) or not prior.learned:
-        raise ConfigError(
-            "policy.draw_constants", "expected false for a model without learned constants."
-        )
-    if config.constants_std is not None:
-        covariance = config.constants_std**2 * torch.eye(len(prior.learned))
-    if covariance is None:
-        raise ConfigError(
-            "policy.draw_constants",
-            "expected the covariance of the constants, or policy.constants_std, got neither.",
-        )
-    # The draws have a generator of their own, so that everything else is as without them.
-    return draw_shifts(covariance, config.num_worlds, torch.Generator().manual_seed(seed))
-
-
-def _build(context: Context) -> Phase:
-    config, model = context.config, context.before["model"]
-    settings = context.settings
-    measured = settings.draw_constants and settings.constants_std is None
-    return PolicyTrainer(
-        context.task,
-        model.dynamics,
-        settings,
-        world=context.world,
-        seed=config.seed,
-        data_states=model.states(),
-        compile=config.compile,
-        covariance=model.constants_covariance() if measured else None,
-    )
-
-
-register_phase("policy", PolicyConfig, _build, unit="updates")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -155,6 +156,7 @@ class RealTD3Trainer(TD3Trainer):
         priced = TaskWorldModel(task, model.transitions)
         super().__init__(priced, config, seed=seed, compile=compile)
         self.config = config
+        self.seconds = 0.0
         self.world = Rollouts(priced, act, task.max_steps, compile=compile)
         self._played = self.world
         if model.task != task:
@@ -221,6 +223,15 @@ class RealTD3Trainer(TD3Trainer):
         """Returns ``[evaluation_episodes]`` of the noise-free actor in the real world."""
         states, steps = self._evaluation_states, self.task.max_steps
         return self._played.returns(self.update.networks.actor, states, steps).total
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a resumed run needs, tensors and numbers only."""
+        return {**super().state_dict(), "seconds": self.seconds}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a :meth:`state_dict`."""
+        super().load_state_dict(state)
+        self.seconds = state["seconds"]
 
     def parts(self) -> dict[str, Any]:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from phihp_torchrl.agents import TD3Config, TD3Update, make_td3_loss
-from phihp_torchrl.agents.td3 import layers
+from phihp_torchrl.agents.update import layers
 from phihp_torchrl.imagination import Batch
 from phihp_torchrl.worlds import SimulatedWorld
 

@@ -20,7 +20,7 @@ from phihp_torchrl.agents import (
     make_td3_loss,
     make_twin_qvalue,
 )
-from phihp_torchrl.agents.td3 import layers
+from phihp_torchrl.agents.update import layers
 from phihp_torchrl.worlds import SimulatedWorld
 
 PENDULUM = get_task("pendulum")

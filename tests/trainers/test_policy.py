@@ -89,7 +89,7 @@ def test_the_best_actor_is_kept():
     for layer, expected in zip(kept, actors[best], strict=True):
         assert torch.equal(layer, expected)
     rollouts = Rollouts(trainer.world_model, act, max_age=5)
-    score = rollouts.returns(kept, trainer._evaluation_states[:4], steps=5).total
+    score = rollouts.returns(kept, trainer.evaluation.states[:4], steps=5).total
     assert score.mean().item() == pytest.approx(trainer.best_return)
 
 
@@ -180,7 +180,7 @@ def test_lives_start_in_real_data():
     config = replace(POLICY, start=StartConfig(reset=0, data=1, coverage=0, goal=0), max_age=1)
     trainer = policy_trainer(config, data_states=states)
     trainer.advance()
-    seen = trainer.replay.rows[: len(trainer.replay), :2].unique(dim=0)
+    seen = trainer.learner.replay.rows[: len(trainer.learner.replay), :2].unique(dim=0)
     assert torch.equal(seen, states.flip(0))
 
 
@@ -191,7 +191,7 @@ def test_data_states_must_be_given():
 
 def test_lives_begin_at_all_ages():
     trainer = policy_trainer(replace(POLICY, num_worlds=500, max_age=5))
-    assert trainer.worlds.age.unique().tolist() == [0, 1, 2, 3, 4]
+    assert trainer.learner.worlds.age.unique().tolist() == [0, 1, 2, 3, 4]
     assert policy_trainer(replace(POLICY, max_age=None)).max_age == PENDULUM.max_steps
 
 

@@ -65,10 +65,10 @@ def test_actor_critics_and_metrics_are_in_physical_units():
     actor = [p.detach() for p in trainer.best_actor().module.mlp.parameters()]
     model = TaskWorldModel(task, HybridDynamics.pure_prior(task))
     rollouts = Rollouts(model, act, max_age=5)
-    physical = rollouts.returns(actor, trainer._evaluation_states, steps=5).total.mean().item()
+    physical = rollouts.returns(actor, trainer.evaluation.states, steps=5).total.mean().item()
     assert physical == pytest.approx(trainer.best_return, rel=1e-4)
     actor = [p.detach() for p in trainer.actor().module.mlp.parameters()]
-    played = rollouts.returns(actor, trainer._world_states, steps=5).total.mean().item()
+    played = rollouts.returns(actor, trainer.evaluation.world_states, steps=5).total.mean().item()
     assert metrics["policy/real_return"] == pytest.approx(played, rel=1e-3)
     # The critics value a state as the refit's targets do: by rewards of this size.
     state = task.coverage.sample([64])

@@ -45,7 +45,7 @@ def test_imagined_transitions_are_those_of_each_worlds_model():
     dynamics = HybridDynamics.hybrid(PENDULUM, ensemble=2)
     trainer = policy_trainer(DRAWN, dynamics=dynamics, covariance=COVARIANCE)
     train(trainer)
-    batch = stored(trainer.replay)
+    batch = stored(trainer.learner.replay)
     view = per_life(dynamics, trainer.shifts)
     rows = len(batch.state) // DRAWN.num_worlds * DRAWN.num_worlds
     folded = [part[:rows].reshape(-1, DRAWN.num_worlds, part.shape[-1]) for part in batch[:2]]
@@ -63,7 +63,9 @@ def test_without_draws_nothing_is_drawn_or_kept():
 def test_draws_leave_all_other_random_numbers_as_they_are():
     plain_one, drawn = policy_trainer(), policy_trainer(DRAWN, covariance=0 * COVARIANCE)
     assert train(plain_one).keys() == train(drawn).keys()
-    for one, other in zip(stored(plain_one.replay), stored(drawn.replay), strict=True):
+    for one, other in zip(
+        stored(plain_one.learner.replay), stored(drawn.learner.replay), strict=True
+    ):
         torch.testing.assert_close(one, other)
 
 

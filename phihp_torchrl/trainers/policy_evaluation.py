@@ -1,0 +1,66 @@
+"""The episodes that choose the actor to keep, and those in a simulated world, for the log alone."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.agents import Layers, Scales, act, scaled
+from phihp_torchrl.imagination import Rollouts
+from phihp_torchrl.trainers.policy_config import PolicyConfig
+from phihp_torchrl.worlds import World
+
+
+class ActorEvaluation:
+    """Plays the noise-free actor from the task's resets, in the model and in a simulated world.
+
+    Args:
+        rollouts: rollouts of an actor in the model, in the units of ``scales``.
+        scales: those units; the returns are in physical ones.
+        config: settings of the phase.
+        world: the real world, if there is one.
+        seed: seed of the world's episodes.
+        generator: source of the model's start states.
+        compile: whether to compile the episodes in the world.
+    """
+
+    def __init__(
+        self,
+        rollouts: Rollouts,
+        scales: Scales,
+        config: PolicyConfig,
+        *,
+        world: World | None,
+        seed: int,
+        generator: torch.Generator,
+        compile: bool,
+    ) -> None:
+        task = rollouts.task
+        self.rollouts, self.scales = rollouts, scales
+        self.steps = config.evaluation_steps or task.max_steps
+        self.states = task.sample_start([config.evaluation_episodes], generator)
+        truth = None if world is None or not config.real_evaluation_episodes else world.model()
+        self.world = None
+        if truth is not None:
+            truth = scaled(truth, scales)
+            self.world = Rollouts(truth, act, rollouts.max_age, compile=compile)
+        # The world's episodes have a generator of their own: the log has no part in the training.
+        self.world_states = task.sample_start(
+            [config.real_evaluation_episodes], torch.Generator().manual_seed(seed)
+        )
+
+    def imagined(self, actor: Layers) -> float:
+        """Mean return in the model; minus infinity where the actor left the finite numbers."""
+        return self._play(self.rollouts, actor, self.states)
+
+    def real(self, actor: Layers) -> dict[str, float]:
+        """Mean return in the simulated world, to log; nothing without one."""
+        if self.world is None:
+            return {}
+        return {"policy/real_return": self._play(self.world, actor, self.world_states)}
+
+    def _play(self, world: Rollouts, actor: Layers, states: Tensor) -> float:
+        score = world.returns(actor, states, self.steps).total
+        return self.scales.reward * torch.nan_to_num(score, nan=-math.inf).mean().item()
