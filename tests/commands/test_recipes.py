@@ -47,8 +47,8 @@ def test_phihp_then_resume_then_evaluate(
     assert during["planner"]["returns"] == results["planner"]["returns"]
     load_agent(tmp_path / "agent")  # what the recipe writes beside it does no harm
 
-    recipe("evaluate", "agent=agent", "planner=false", "out_dir=there", "video=false", "baselines=none",
-           *small)  # fmt: skip
+    alone = ("planner=false", "out_dir=there", "video=false", "baselines=none", *small)
+    recipe("evaluate", "agent=agent", *alone)
     assert json.loads((tmp_path / "there" / "evaluation.json").read_text()).keys() == {"actor"}
     assert not (tmp_path / "there" / "episode.gif").exists()
 
