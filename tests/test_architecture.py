@@ -24,6 +24,7 @@ FOLDERS = (
     "imagination",
     "agents",
     "planners",
+    "baselines",
     "worlds",
     "deployment",
     "evaluation",

@@ -31,6 +31,8 @@ class PlayConfig:
         world: settings of the world to play in, with their kind; null for the world that the agent
             was trained in.
         latency_actions: actions whose time is measured, one at a time; 0 for none.
+        baselines: controllers by hand to play beside it, built in its model; auto (the quick ones
+            that apply, in a simulated world), none, or a list of their names.
         video: whether to write a GIF of an episode (needs the extra rendering).
         out_dir: directory of pictures and evaluation.json; null for that of the agent.
         plugins: Python files or modules to import, which register tasks and worlds.
@@ -44,6 +46,7 @@ class PlayConfig:
     seed: int = 0
     world: Any = None
     latency_actions: int = 1000
+    baselines: str | tuple[str, ...] = "auto"
     video: bool = True
     out_dir: str | None = None
     plugins: tuple[str, ...] = field(default=())
@@ -69,11 +72,20 @@ def play(config: PlayConfig) -> None:
     """
     import torch
 
+    from phihp_torchrl.baselines import check_names
     from phihp_torchrl.deployment import AgentError
-    from phihp_torchrl.evaluation import markdown_table, show_episode
+    from phihp_torchrl.evaluation import (
+        BASELINES_KEY,
+        controllers_table,
+        evaluation_seed,
+        markdown_table,
+        play_baselines,
+        show_episode,
+    )
     from phihp_torchrl.trainers import import_plugins
 
     import_plugins(config.plugins)
+    check_names(config.baselines)
     try:
         agents = _load(config)
     except AgentError as error:
@@ -87,6 +99,17 @@ def play(config: PlayConfig) -> None:
     header = [f"{shown.task.name} in {world}", *results]
     table = [[row, *(f"{result[row]:.3f}" for result in results.values())] for row in rows]
     print(markdown_table(header, table))  # noqa: T201 (a console command)
+    beside = play_baselines(
+        shown,
+        world,
+        config.baselines,
+        episodes=config.episodes,
+        seed=evaluation_seed(config.seed),
+        latency_actions=config.latency_actions,
+    )
+    if beside:
+        print(controllers_table("controller", {**results, **beside}))  # noqa: T201
+        results[BASELINES_KEY] = beside
     directory = Path(config.out_dir or config.agent)
     directory.mkdir(parents=True, exist_ok=True)
     (directory / "evaluation.json").write_text(json.dumps(results, indent=2) + "\n")

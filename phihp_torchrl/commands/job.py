@@ -19,9 +19,10 @@ from phihp_torchrl.config import (
     override_lines,
     publish_offers,
 )
-from phihp_torchrl.evaluation import returns_table
+from phihp_torchrl.evaluation import controllers_table, returns_table
 from phihp_torchrl.trainers import (
     RunResult,
+    read_controllers,
     read_request,
     read_result,
     run,
@@ -69,4 +70,6 @@ def tell(result: RunResult) -> None:
     earned = read_result(result.path)
     if earned is not None:
         print(f"\n{returns_table([earned])}")  # noqa: T201
+    if (beside := read_controllers(result.path)) is not None:
+        print(f"{controllers_table('controller', beside)}")  # noqa: T201
     print(f"Everything is in {result.path}")  # noqa: T201

@@ -1,4 +1,4 @@
-"""``phihp list``: tasks, methods, presets, worlds and planners, a line each."""
+"""``phihp list``: tasks, methods, presets, worlds, planners and baselines, a line each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ListConfig:
 
 
 def main(words: Sequence[str]) -> None:
-    """Print the registered tasks, methods, presets, worlds and planners."""
+    """Print the registered tasks, methods, presets, worlds, planners and baselines."""
     run_command(ListConfig, words, "phihp list [plugins=[my_task.py]]", _do)
 
 
@@ -30,12 +30,13 @@ def _do(config: ListConfig) -> None:
 
 
 def listing(config: ListConfig | None = None) -> str:
-    """List tasks, methods, presets, worlds and planners, under a heading for each.
+    """List tasks, methods, presets, worlds, planners and baselines, under a heading for each.
 
     Examples:
         >>> listing().splitlines()[0]
         'tasks (task=...)'
     """
+    from phihp_torchrl.baselines import BASELINES
     from phihp_torchrl.planners import PLANNERS
     from phihp_torchrl.tasks import get_task, list_tasks
     from phihp_torchrl.trainers import import_plugins
@@ -54,6 +55,10 @@ def listing(config: ListConfig | None = None) -> str:
         },
         "worlds (world=...)": {name: kind.about for name, kind in WORLDS.items()},
         "planners (planner=...)": {name: kind.about for name, kind in PLANNERS.items()},
+        "baselines (evaluate.baselines=[...])": {
+            name: f"{kind.about}{'; only where named' if kind.slow else ''}"
+            for name, kind in BASELINES.items()
+        },
     }
     lines = []
     for title, entries in sections.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.evaluation.beside import BASELINES_KEY, controllers_table, play_baselines
 from phihp_torchrl.evaluation.episode import Episode, play_episode
 from phihp_torchrl.evaluation.figures import episode_figure
 from phihp_torchrl.evaluation.latency import Latency, measure_latency

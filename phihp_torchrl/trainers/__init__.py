@@ -24,7 +24,7 @@ from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.policy_phase import build_policy
 from phihp_torchrl.trainers.record import record
-from phihp_torchrl.trainers.results import read_result
+from phihp_torchrl.trainers.results import read_controllers, read_result
 from phihp_torchrl.trainers.run import RunResult, run
 from phihp_torchrl.trainers.run_config import (
     RunConfig,

@@ -9,9 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from phihp_torchrl.baselines import check_names
 from phihp_torchrl.config import check_count
 from phihp_torchrl.deployment import Agent, save_agent
-from phihp_torchrl.evaluation import evaluate, measure_latency, show_episode
+from phihp_torchrl.evaluation import (
+    BASELINES_KEY,
+    controllers_table,
+    evaluate,
+    measure_latency,
+    play_baselines,
+    show_episode,
+)
 from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
@@ -32,6 +40,8 @@ class EvaluateConfig:
         episodes: real episodes, from seeds that no training uses.
         latency_actions: actions whose time is measured, one at a time; 0 for none.
         video: whether to write a GIF of an episode (needs the extra rendering).
+        baselines: controllers by hand to play beside the agent, built in its model; auto (the quick
+            ones that apply, in a simulated world), none, or a list of their names.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.
@@ -46,10 +56,12 @@ class EvaluateConfig:
     episodes: int = 50
     latency_actions: int = 200
     video: bool = True
+    baselines: str | tuple[str, ...] = "auto"
 
     def __post_init__(self) -> None:
         check_count(self, "episodes")
         check_count(self, "latency_actions", least=0)
+        check_names(self.baselines)
 
 
 class NewFile(NamedTuple):
@@ -115,7 +127,8 @@ class EvaluatePhase:
         self.new_files = []
         if len(self.results) < len(self._steps):
             return self._evaluate(*self._steps[len(self.results)])
-        self._save()
+        beside = self._beside()
+        self._save(beside)
         if self.world.has_env:
             self._show()
         else:
@@ -124,7 +137,12 @@ class EvaluatePhase:
                 self.world,
             )
         self._finished = True
-        return {}
+        return {
+            f"evaluate/{name}/{key}": value
+            for name, result in beside.items()
+            for key, value in result.items()
+            if key != "returns"
+        }
 
     def state_dict(self) -> dict[str, Any]:
         return {"results": self.results, "finished": self._finished}
@@ -151,7 +169,22 @@ class EvaluatePhase:
         self.results[name] = {**summary, "returns": played.returns.tolist()}
         return {f"evaluate/{name}/{key}": value for key, value in summary.items()}
 
-    def _save(self) -> None:
+    def _beside(self) -> dict[str, dict[str, Any]]:
+        """Play the baselines in the same episodes."""
+        settings = self.settings
+        beside = play_baselines(
+            self.agent,
+            self.world,
+            settings.baselines,
+            episodes=settings.episodes,
+            latency_actions=settings.latency_actions,
+        )
+        if beside:
+            table = controllers_table("controller", {**self.results, **beside})
+            _log.info("The agent beside controllers by hand in its model:\n%s", table)
+        return beside
+
+    def _save(self, beside: Mapping[str, dict[str, Any]]) -> None:
         origin = (self.directory.read_metadata().get("sessions") or [{}])[0]
         metadata = {
             "seed": self.config.seed,
@@ -163,7 +196,8 @@ class EvaluatePhase:
             "returns": self.results,
         }
         save_agent(self.agent, self.directory.agent, metadata=metadata)
-        write_atomically(self.directory.evaluation, json.dumps(self.results, indent=2) + "\n")
+        results = {**self.results, **({BASELINES_KEY: beside} if beside else {})}
+        write_atomically(self.directory.evaluation, json.dumps(results, indent=2) + "\n")
         label = f"{self.config.task}-{self.config.label}"
         self.new_files.append(NewFile(label, self.directory.agent))
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from phihp_torchrl.config import METHODS
-from phihp_torchrl.evaluation import TaskResult
+from phihp_torchrl.evaluation import BASELINES_KEY, TaskResult
 from phihp_torchrl.trainers.run_directory import RunDirectory
 
 
@@ -21,6 +22,7 @@ def read_result(path: Path) -> TaskResult | None:
     if not directory.evaluation.is_file():
         return None
     results = json.loads(directory.evaluation.read_text())
+    results.pop(BASELINES_KEY, None)  # they are not what was learned
     if not results:  # a world in which nobody can act
         return None
     means = {name: (result["return_mean"],) for name, result in results.items()}
@@ -31,3 +33,17 @@ def read_result(path: Path) -> TaskResult | None:
     # Targets and published returns are for simulated worlds only.
     task = config["task"] if world == "simulated" else f"{config['task']} in {world}"
     return TaskResult(task, samples, label=label, **means)
+
+
+def read_controllers(path: Path) -> dict[str, dict[str, Any]] | None:
+    """Read what the run's agent and the baselines earned, by name; ``None`` without baselines.
+
+    Args:
+        path: directory of the run.
+    """
+    directory = RunDirectory(path)
+    if not directory.evaluation.is_file():
+        return None
+    results = json.loads(directory.evaluation.read_text())
+    beside = results.pop(BASELINES_KEY, None)
+    return None if beside is None else {**results, **beside}

@@ -23,11 +23,13 @@ BRIEF = (
     "progress=false",
     "evaluate.episodes=2",
     "evaluate.latency_actions=3",
+    "evaluate.baselines=none",
     "evaluate.video=false",
 )
 """A run that ends as soon as it has learned."""
 
-EVALUATE = ("evaluate", "agent=run/agent", "episodes=2", "latency_actions=3", "video=false")
+EVALUATE = ("evaluate", "agent=run/agent", "episodes=2", "latency_actions=3", "video=false",
+            "baselines=none")  # fmt: skip
 """An evaluation of its agent."""
 
 RIG = """

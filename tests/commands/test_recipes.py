@@ -37,7 +37,8 @@ def test_phihp_then_resume_then_evaluate(
     recipe("evaluate", "agent=agent", *small)
     assert "| pendulum in simulated | planner | actor |" in capsys.readouterr().out
     results = json.loads((tmp_path / "agent" / "evaluation.json").read_text())
-    assert results.keys() == {"planner", "actor"}
+    assert results.keys() == {"planner", "actor", "baselines"}
+    assert results["baselines"].keys() == {"lqr", "pid", "energy"}
     assert len(results["actor"]["returns"]) == 2
     assert (tmp_path / "agent" / "episode.png").exists()
     assert (tmp_path / "agent" / "episode.gif").exists()
@@ -46,7 +47,8 @@ def test_phihp_then_resume_then_evaluate(
     assert during["planner"]["returns"] == results["planner"]["returns"]
     load_agent(tmp_path / "agent")  # what the recipe writes beside it does no harm
 
-    recipe("evaluate", "agent=agent", "planner=false", "out_dir=there", "video=false", *small)
+    alone = ("planner=false", "out_dir=there", "video=false", "baselines=none", *small)
+    recipe("evaluate", "agent=agent", *alone)
     assert json.loads((tmp_path / "there" / "evaluation.json").read_text()).keys() == {"actor"}
     assert not (tmp_path / "there" / "episode.gif").exists()
 

@@ -38,6 +38,7 @@ TINY = {
     "planner.num_kept_elites": 0,
     "evaluate.episodes": 1,
     "evaluate.latency_actions": 0,
+    "evaluate.baselines": "none",
     "evaluate.video": False,
     "compile": False,
     "progress": False,

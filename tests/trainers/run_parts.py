@@ -49,7 +49,7 @@ POLICY = PolicyConfig(
     td3=TD3Config(actor_hidden_sizes=(8,), critic_hidden_sizes=(8,)),
     refit=RefitConfig(interval=0),
 )
-EVALUATE = EvaluateConfig(episodes=2, latency_actions=0, video=False)
+EVALUATE = EvaluateConfig(episodes=2, latency_actions=0, video=False, baselines="none")
 CONFIG = RunConfig(
     task="brief-pendulum",
     checkpoint_interval=0.0,

@@ -16,6 +16,7 @@ import yaml
 
 from grid.cell import DEFAULT_METHOD
 from measures import CurvePoint, curve_from_metrics, read_curve
+from phihp_torchrl.evaluation import BASELINES_KEY
 from phihp_torchrl.origin import commit_text, machine_text
 
 
@@ -174,6 +175,8 @@ def _acting(evaluation: Mapping[str, Any]) -> dict[str, Acting]:
         raise ValueError("evaluation.json: expected returns, got none.")
     acting = {}
     for name, part in evaluation.items():
+        if name == BASELINES_KEY:
+            continue
         returns = tuple(float(value) for value in part["returns"])
         bad = sum(not math.isfinite(value) for value in returns)
         if bad or not returns:

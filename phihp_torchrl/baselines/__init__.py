@@ -1,0 +1,17 @@
+"""Controllers by hand in a learned model, to hold a learned controller against."""
+
+from __future__ import annotations
+
+from phihp_torchrl.baselines.controller import Controller
+from phihp_torchrl.baselines.energy_shaping import EnergyShaping, PumpConfig
+from phihp_torchrl.baselines.lqr import LQR
+from phihp_torchrl.baselines.pid import PID
+from phihp_torchrl.baselines.registry import (
+    BASELINES,
+    BaselineKind,
+    check_names,
+    make_baselines,
+    register_baseline,
+)
+
+__all__ = ["LQR", "PID", "EnergyShaping", "make_baselines", "register_baseline"]

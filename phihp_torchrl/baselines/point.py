@@ -1,0 +1,187 @@
+"""Where a task wants its system to stay, and the linear model around that state."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.func import jacfwd
+
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.tasks import Step, Task
+
+Matrix = NDArray[np.float64]
+
+_DRIFT = 0.01
+"""The largest motion in one step, in half-ranges of the state, of what counts as a rest."""
+_SAMPLES = 512
+"""States of the wide box whose rewards are compared with that of a goal."""
+
+
+@dataclass(frozen=True)
+class LinearModel:
+    """A task's one step around a state at rest: ``z[k+1] = A z[k] + B u[k]``.
+
+    ``z`` is the difference to the point's state, of angles on the circle, and ``u`` that to its
+    action. For a task with an actuator both have its registers, unless they were left out.
+
+    Args:
+        task: the task.
+        state: the state at rest, float64 ``[n]``.
+        action: the action that keeps it there, float64 ``[m]``.
+        a: the matrix A, ``[n, n]``.
+        b: the matrix B, ``[n, m]``.
+    """
+
+    task: Task
+    state: Tensor
+    action: Tensor
+    a: Matrix
+    b: Matrix
+
+    def difference(self, state: Tensor) -> Tensor:
+        """``state - self.state``, in the dtype and on the device of ``state`` ``[*batch, n]``."""
+        physical, registers = self.task.split(state)
+        at, under_way = self.task.split(self.state.to(state))
+        delta = self.task.system.difference(physical, at)
+        if not under_way.shape[-1]:
+            return delta
+        return torch.cat([delta, registers - under_way], -1)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the components of the state, registers by number."""
+        own = self.task.system.state_names
+        return (*own, *(f"register {i}" for i in range(len(self.a) - len(own))))
+
+
+def physical_step(dynamics: nn.Module) -> Step:
+    """The step of a model for what acts on the system, without clipping."""
+    return getattr(dynamics, "step", dynamics)
+
+
+def half_ranges(task: Task) -> tuple[Tensor, Tensor]:
+    """Half-ranges of state and action, float64 ``[n]`` and ``[m]``: the units of "large".
+
+    Those of the state are of the task's wide box, or else of its reset box; 1 where that is a
+    point.
+    """
+    box = task.coverage or task.reset
+    half = (torch.tensor(box.high).double() - torch.tensor(box.low).double()) / 2
+    return torch.where(half > 0, half, torch.ones_like(half)), task.bounds.scale.double()
+
+
+def linearise(
+    task: Task,
+    dynamics: nn.Module,
+    goal: Sequence[float] | None = None,
+    *,
+    registers: bool = True,
+) -> LinearModel:
+    """The linear model of one step at the goal, by forward differentiation of the model.
+
+    Args:
+        task: the task.
+        dynamics: the model, ``(state, action) -> next state``.
+        goal: the physical state at which to linearise. Defaults to the task's goal: the centre of
+            its box ``goal``, or else a state at rest whose reward no state of the wide box exceeds.
+        registers: whether the registers of an actuator belong to the state.
+
+    Raises:
+        ConfigError: where there is no such state, or the model does not rest in it.
+    """
+    dynamics = copy.deepcopy(dynamics).to(device="cpu", dtype=torch.float64)
+    step = physical_step(dynamics)
+    state, action = _rest(task, step, goal)
+    at, move = state, step
+    if registers and task.register_count:
+        at, move = torch.cat([state, _under_way(task, action)]), _with_registers(task, step)
+    with torch.no_grad():
+        a, b = (m.detach().numpy() for m in jacfwd(move, (0, 1))(at, action))
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise ConfigError("dynamics", "expected finite derivatives at the goal, got others.")
+    return LinearModel(task, at, action, a, b)
+
+
+def _with_registers(task: Task, step: Step) -> Step:
+    """The step of the whole state, registers included."""
+
+    def move(state: Tensor, action: Tensor) -> Tensor:
+        physical, waiting = task.split(state)
+        acting, waiting = task.acting(waiting, action)
+        return torch.cat([step(physical, acting), waiting], -1)
+
+    return move
+
+
+def _under_way(task: Task, action: Tensor) -> Tensor:
+    """The registers after ``action`` ``[m]`` has been held for long, ``[r]``."""
+    assert task.actuator is not None
+    return task.actuator.rest(action)
+
+
+def _rest(task: Task, step: Step, goal: Sequence[float] | None) -> tuple[Tensor, Tensor]:
+    """The goal, and the action that keeps it."""
+    if goal is not None:
+        if len(goal) != task.system.state_dim:
+            raise ConfigError(
+                "goal",
+                f"expected {task.system.state_dim} values for {task.system.state_names}, "
+                f"got {tuple(goal)}.",
+            )
+        places = [torch.tensor(list(goal)).double()]
+    else:
+        boxes = (task.goal,) if task.goal is not None else (task.coverage, task.reset)
+        places = [
+            (torch.tensor(box.low).double() + torch.tensor(box.high).double()) / 2
+            for box in boxes
+            if box is not None
+        ]
+    reasons = []
+    for state in places:
+        action, drift = _trim(task, step, state)
+        if drift > _DRIFT:
+            reasons.append(f"the model drifts from {_text(state)} by {drift:.2g} half-ranges")
+        elif goal is None and _is_exceeded(task, state, action):
+            reasons.append(f"other states earn more than {_text(state)}")
+        else:
+            return state, action
+    raise ConfigError("goal", f"expected a state to stay in: {'; '.join(reasons)}.")
+
+
+def _trim(task: Task, step: Step, state: Tensor) -> tuple[Tensor, float]:
+    """The action ``[m]`` that keeps ``state`` best, and how far it still moves in a step."""
+    ranges, _ = half_ranges(task)
+    action = task.bounds.center.double()
+
+    def drift(a: Tensor) -> Tensor:
+        return task.difference(step(state, a), state) / ranges
+
+    with torch.no_grad():
+        for _ in range(5):
+            slope = jacfwd(drift)(action)
+            action = task.clip_action(action - torch.linalg.pinv(slope, rtol=1e-9) @ drift(action))
+        left = drift(action).abs().max().item()
+    return action, left if left == left else float("inf")
+
+
+def _is_exceeded(task: Task, state: Tensor, action: Tensor) -> bool:
+    """Whether a state of the wide box earns more than ``state``, for the same action."""
+    generator = torch.Generator().manual_seed(0)
+    box = task.coverage or task.reset
+    others = box.sample([_SAMPLES], generator=generator, dtype=torch.float64)
+    actions = action.expand(_SAMPLES, -1)
+    with torch.no_grad():
+        earned = task.reward(others, actions, others)
+        here = task.reward(state[None], action[None], state[None])[0]
+    spread = (earned.max() - earned.min()).item()
+    return bool(earned.max() > here + 1e-3 * spread)
+
+
+def _text(state: Tensor) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in state.tolist()) + ")"
