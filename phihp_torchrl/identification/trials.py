@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from phihp_torchrl.dynamics import signed_rank
 from phihp_torchrl.identification.model import Model
 from phihp_torchrl.identification.settling import noise
 from phihp_torchrl.identification.shooting import Shooting, robust
@@ -102,30 +103,3 @@ class Trials:
         clear = max(signed_rank(gain), mean) >= _CLEAR
         everywhere = bool((gain > 0).all()) and len(gain) >= 5
         return (clear or everywhere) and bool(gain.sum() > _WORTH * before.sum())
-
-
-def signed_rank(gain: Tensor) -> float:
-    """How many standard errors paired gains are above none, by their ranks (Wilcoxon, 1945).
-
-    A mean of gains and its standard error are blunted by a few windows, such as those near a stop
-    or those that met a disturbance, in which both models are far off. Ranks are not.
-
-    Args:
-        gain: differences ``[W]``. Those that are zero do not count.
-
-    Returns:
-        The sum of the ranks of their sizes, with their signs, over its standard deviation if either
-        sign were as likely; 0 where nothing differs.
-
-    Examples:
-        >>> gain = torch.tensor([0.5, 0.4, 0.0, -0.1, 0.6, 0.7, -90.0])
-        >>> round(signed_rank(gain), 2)  # ranks 3, 2, -1, 4, 5, -6
-        0.73
-        >>> round(signed_rank(gain.abs()), 2), signed_rank(torch.zeros(3))
-        (2.2, 0.0)
-    """
-    gain = gain[gain != 0]
-    if not len(gain):
-        return 0.0
-    rank = gain.abs().argsort().argsort().to(gain) + 1.0
-    return float((gain.sign() * rank).sum() / rank.square().sum().sqrt())

@@ -163,11 +163,15 @@ class _Run:
         return RunResult(self.directory.path, finished, self.interrupt.signal, self.latest)
 
     def _make_phase(self, name: str) -> Phase:
+        world = self.world
+        for phase in self.phases.values():  # one may have found out more of the world's task
+            known = getattr(phase, "world", None)
+            world = known if isinstance(known, World) else world
         context = Context(
             config=self.config,
             settings=self.config.section(name),
-            task=self.world.task,
-            world=self.world,
+            task=world.task,
+            world=world,
             before=dict(self.phases),
             directory=self.directory,
         )
