@@ -20,6 +20,9 @@ _CLEAR = 3.0
 _WORTH = 0.005
 """Share of the error by which a richer model must be better."""
 
+_EXACT = 1e-6
+"""Residuals below this share of the motion are rounding."""
+
 
 class Trial(NamedTuple):
     """A model that was fitted to few windows.
@@ -95,6 +98,8 @@ class Trials:
     def better(self, trial: Trial, best: Trial) -> bool:
         """Whether windows are clearly better (or all of them), and by half a percent together."""
         sigma = self.noise(best)
+        if self._is_exact(sigma):
+            return False
         before = self.losses(best, sigma)
         gain = before - self.losses(trial, sigma)
         mean = float(
@@ -103,3 +108,10 @@ class Trials:
         clear = max(signed_rank(gain), mean) >= _CLEAR
         everywhere = bool((gain > 0).all()) and len(gain) >= 5
         return (clear or everywhere) and bool(gain.sum() > _WORTH * before.sum())
+
+    def _is_exact(self, sigma: Tensor) -> bool:
+        """Whether nothing is left but rounding, which no model explains."""
+        mask, measured = self.windows.mask, self.windows.measured
+        seen = mask.any(0).any(0).nonzero().flatten().tolist()
+        spreads = {i: measured[..., i][mask[..., i]].std() for i in seen}
+        return all(bool(sigma[i] < _EXACT * spread) for i, spread in spreads.items())
