@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.dynamics.actuator_choice import (
+    ActuatorTrial,
+    choose_actuator,
+    explained_by_commands,
+)
 from phihp_torchrl.dynamics.covariance import constants_covariance, draw_shifts
 from phihp_torchrl.dynamics.ensemble import EnsembleResidual
 from phihp_torchrl.dynamics.fit_config import FitConfig
@@ -16,8 +21,10 @@ from phihp_torchrl.dynamics.hybrid import PRIORS, RESIDUAL_OUTPUTS, HybridDynami
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.dynamics.per_life import per_life
 from phihp_torchrl.dynamics.prior import PhysicsPrior, perturbed_constants
+from phihp_torchrl.dynamics.ranks import signed_rank
 from phihp_torchrl.dynamics.residual import ACTIVATIONS, ResidualMLP
 from phihp_torchrl.dynamics.solver_choice import AUTO, SOLVERS, fit_solver
+from phihp_torchrl.dynamics.under_way import with_registers
 from phihp_torchrl.dynamics.world_model import TaskWorldModel
 
 __all__ = [

@@ -105,11 +105,11 @@ def fit_solver(
         >>> loss.dynamics.integrator.name
         'rk4'
     """
-    start, draws = copy.deepcopy(loss.state_dict()), _draws(generator)
+    start, draws = copy.deepcopy(loss.state_dict()), draws_of(generator)
 
     def fit_with(solver: Integrator, config: FitConfig) -> FitReport:
         loss.load_state_dict(start)
-        _set_draws(generator, draws)
+        set_draws(generator, draws)
         loss.dynamics.integrator = solver
         return fit(loss, train, held_out, config, generator)
 
@@ -150,11 +150,13 @@ def path_error(loss: DynamicsLoss, data: TensorDictBase) -> float:
     return total.median().item()
 
 
-def _draws(generator: torch.Generator | None) -> torch.Tensor:
+def draws_of(generator: torch.Generator | None) -> torch.Tensor:
+    """The state of a generator, or of torch's global one, from which the same numbers follow."""
     return torch.get_rng_state() if generator is None else generator.get_state()
 
 
-def _set_draws(generator: torch.Generator | None, state: torch.Tensor) -> None:
+def set_draws(generator: torch.Generator | None, state: torch.Tensor) -> None:
+    """Go back to a state of :func:`draws_of`."""
     if generator is None:
         torch.set_rng_state(state)
     else:

@@ -13,6 +13,7 @@ from phihp_torchrl.identification.parts import (
     AT_LIMIT,
     FIXED,
     IDENTIFIED,
+    IF_COMPLETE,
     NOT_IDENTIFIED,
     Estimate,
     Finding,
@@ -26,10 +27,13 @@ from phihp_torchrl.systems import System
 
 BEFORE = 5
 """How many previous commands are looked at."""
-_EXPLAINED = 0.1
+_EXPLAINED = 0.2
 _WHITE = 0.3
+_ROWS = 20  # samples that a regression needs for each column
+_STRIDE = 4  # samples over which residuals are compared
 _OVER = 2.0
 _EXACT = 1e-5  # residuals below this share of the motion are those of the integrator
+_HARMLESS = 2e-3  # errors below this share of the change are small, however small the noise is
 _MISFIT = 3.0  # ratio of the error of predictions to the noise at which intervals are doubted
 
 
@@ -43,6 +47,9 @@ def of_constants(constants: Mapping[str, Estimate]) -> list[Finding]:
             found.append(Finding("limit", text, c.advice))
         elif c.verdict == NOT_IDENTIFIED:
             found.append(Finding("unknown", f"{name} is not identified by these data.", c.advice))
+        elif c.verdict == IF_COMPLETE:
+            text = f"{name} is identified only if the equations are complete, which they are not."
+            found.append(Finding("complete", text, c.advice))
         elif c.verdict not in (IDENTIFIED, FIXED):
             groups.setdefault(c.advice, []).append(name)
     for advice, names in groups.items():
@@ -82,7 +89,9 @@ def of_residuals(
                     "spring, a stop) to the prior, or let a residual learn it.",
                 )
             )
-        share = max(_explained(samples, windows, r, mask, i) for i in (0, 2))
+        # A force shows in the first difference of a velocity, and the second of a position.
+        differences = 2 if name in system.velocity_of else 1
+        share = _explained(samples, windows, fit.states, r, mask, differences)
         if share > _EXPLAINED:
             found.append(
                 Finding(
@@ -96,24 +105,44 @@ def of_residuals(
 
 
 def _explained(
-    samples: Samples, windows: Windows, r: Tensor, mask: Tensor, differences: int
+    samples: Samples, windows: Windows, states: Tensor, r: Tensor, mask: Tensor, differences: int
 ) -> float:
-    """Share of the residuals (or their second differences) that previous commands explain."""
-    index = windows.index[:, differences:]
-    good = mask
+    """Share of the residuals' differences that commands before explain.
+
+    Differences are taken over a few samples, in which the effect of a command adds up and noise
+    does not. What is linear in the sum of their commands, weighted as a force acts, and in the
+    states now and before is taken away from both: a wrong gain goes with the former, and friction
+    that the equations leave out with the speeds, which the commands before have caused.
+    """
+    span = differences * _STRIDE
+    good, weight = mask, torch.ones(1, dtype=r.dtype)
     for _ in range(differences):
-        r, good = r.diff(dim=1), good[:, 1:] & good[:, :-1]
-    known = good & (index - BEFORE - differences >= samples.first[index])
-    columns = [
-        samples.action[(index[known] - k).clamp_min(0)] for k in range(BEFORE + differences + 1)
-    ]
-    x, y = torch.cat(columns, -1), r[known]
-    if len(y) < 20 * x.shape[1]:
+        r = r[:, _STRIDE:] - r[:, :-_STRIDE]
+        good = good[:, _STRIDE:] & good[:, :-_STRIDE]
+        weight = torch.nn.functional.conv1d(
+            weight[None, None], torch.ones(1, 1, _STRIDE, dtype=r.dtype), padding=_STRIDE - 1
+        )[0, 0]
+    index = windows.index[:, span:]
+    known = good & (index - BEFORE - span >= samples.first[index])
+    commands = [samples.action[(index[known] - k).clamp_min(0)] for k in range(BEFORE + span + 1)]
+    place = torch.arange(span, states.shape[1])
+    passed = [states[:, place - k][known] for k in (0, span // 2, span)]
+    summed = sum(w * commands[k] for k, w in enumerate(weight.tolist(), start=1))
+    own, before = torch.cat([*passed, summed], -1), torch.cat(commands, -1)
+    left = r[known][:, None]
+    columns = own.shape[1] + before.shape[1] + 1
+    if len(left) < _ROWS * columns:
         return 0.0
-    x, y = x - x.mean(0), y - y.mean()
-    solution = torch.linalg.lstsq(x, y[:, None], driver="gelsd").solution
-    left = (y - (x @ solution)[:, 0]).square().mean() / y.square().mean().clamp_min(1e-300)
-    return 1.0 - float(left)
+    own = (own - own.mean(0)) / own.std(0).clamp_min(1e-12)
+    own = torch.cat([torch.ones_like(own[:, :1]), own], -1)
+    left, before = (_without(own, values) for values in (left, before))
+    ratio = _without(before, left).square().mean() / left.square().mean().clamp_min(1e-300)
+    return 1.0 - float(ratio) * (len(left) - own.shape[1]) / (len(left) - columns)
+
+
+def _without(columns: Tensor, values: Tensor) -> Tensor:
+    """What is left of values ``[N, k]`` when their linear part in columns ``[N, c]`` is gone."""
+    return values - columns @ torch.linalg.lstsq(columns, values, driver="gelsd").solution
 
 
 def _residuals(
@@ -156,7 +185,8 @@ def of_errors(errors: Mapping[str, HorizonError]) -> list[Finding]:
             )
         ]
     steps = max(errors, key=int)
-    ratios = [error.floor_ratio for error in errors[steps].states.values()]
+    known = {n: e for n, e in errors[steps].states.items() if not e.share < _HARMLESS}
+    ratios = [error.floor_ratio for error in known.values()]
     doubt = [
         Finding(
             "incomplete",
@@ -172,7 +202,7 @@ def of_errors(errors: Mapping[str, HorizonError]) -> list[Finding]:
             f"times the noise and {100 * error.share:.2g} % of the change.",
             "Look at the residuals for what the equations leave out, and at the regions for where.",
         )
-        for name, error in errors[steps].states.items()
+        for name, error in known.items()
         if error.floor_ratio > _OVER
     ]
 

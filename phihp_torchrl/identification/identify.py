@@ -10,6 +10,7 @@ import torch
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.identification import diagnostics
+from phihp_torchrl.identification.completeness import doubted, loosen
 from phihp_torchrl.identification.config import IdentifyConfig
 from phihp_torchrl.identification.covariance import uncertainty
 from phihp_torchrl.identification.errors import judge_predictions
@@ -96,21 +97,27 @@ def _report(
     low, high = task.bounds.low.double(), task.bounds.high.double()
     experiments = Experiments(model, fit, samples, low, high)
     constants = judge_constants(model, fit.raw, doubt, experiments.advise)
+    combinations = judge_combinations(model, fit.raw, doubt)
     past = (division.past, config.past)
     judged = judge_predictions(fitted.stopping, samples, fitted.judged, division, past, recordings)
     more, residuals = diagnostics.of_residuals(system, samples, fitted.windows, fit)
+    beyond = diagnostics.of_errors(judged.errors)
+    if any(finding.code in ("white", "incomplete") for finding in (*more, *beyond)):
+        loose = loosen(fitted, samples)
+        constants = doubted(constants, loose.constants)
+        combinations = doubted(combinations, loose.combinations)
     warnings = [
         *diagnostics.of_constants(constants),
         *of_recordings(system, samples),
         *more,
         *diagnostics.of_fit(division.stopped, division.stops, fitted),
-        *diagnostics.of_errors(judged.errors),
+        *beyond,
     ]
     measured = samples.state.isfinite().any(0).tolist()
     names = [name for name, known in zip(system.state_names, measured, strict=True) if known]
     return Identification(
         constants=constants,
-        combinations=judge_combinations(model, fit.raw, doubt),
+        combinations=combinations,
         actuator=judge_actuator(model, fit.raw, doubt, fitted.tried),
         errors=judged.errors,
         regions=tuple(judged.regions),

@@ -9,6 +9,7 @@ from phihp_torchrl.systems import Constant
 from phihp_torchrl.tasks import Actuator
 
 IDENTIFIED = "identified"
+IF_COMPLETE = "identified only if the equations are complete"
 COMBINED = "only in combination with "
 NOT_IDENTIFIED = "not identified by these data"
 FIXED = "fixed"
@@ -24,7 +25,7 @@ class Estimate:
         estimate: the estimate; the guess where nothing was fitted.
         low: lower end of the 95 % interval; ``None`` where the data give none.
         high: its upper end.
-        verdict: ``"identified"``, ``"only in combination with ..."``, ``"not identified by these
+        verdict: ``"identified"``, ``"identified only if the equations are complete"``, ``"only in combination with ..."``, ``"not identified by these
             data"``, ``"fixed"`` or ``"at its limit"``.
         advice: what would identify it, or what to do; empty where nothing is needed.
     """

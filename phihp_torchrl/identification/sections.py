@@ -13,6 +13,7 @@ from phihp_torchrl.identification.parts import (
     COMBINED,
     FIXED,
     IDENTIFIED,
+    IF_COMPLETE,
     NOT_IDENTIFIED,
     Estimate,
     StateError,
@@ -120,6 +121,8 @@ def verdict(e: Estimate) -> tuple[str, str]:
         return f"✓ {text}{_precision(e)}", "good"
     if e.verdict == FIXED:
         return f"■ {text}: it was not fitted", "soft"
+    if e.verdict == IF_COMPLETE:
+        return f"◐ {text}{_precision(e)}", "part"
     if e.verdict == AT_LIMIT:
         return f"▲ {text}", "part"
     if e.verdict.startswith(COMBINED):

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from phihp_torchrl.dynamics import signed_rank
 from phihp_torchrl.identification.model import Model
 from phihp_torchrl.identification.settling import noise
 from phihp_torchrl.identification.shooting import Shooting, robust
@@ -18,6 +19,9 @@ _CLEAR = 3.0
 """Standard errors by which windows of a richer model must be better, by their ranks or mean."""
 _WORTH = 0.005
 """Share of the error by which a richer model must be better."""
+
+_EXACT = 1e-6
+"""Residuals below this share of the motion are rounding."""
 
 
 class Trial(NamedTuple):
@@ -94,6 +98,8 @@ class Trials:
     def better(self, trial: Trial, best: Trial) -> bool:
         """Whether windows are clearly better (or all of them), and by half a percent together."""
         sigma = self.noise(best)
+        if self._is_exact(sigma):
+            return False
         before = self.losses(best, sigma)
         gain = before - self.losses(trial, sigma)
         mean = float(
@@ -103,29 +109,9 @@ class Trials:
         everywhere = bool((gain > 0).all()) and len(gain) >= 5
         return (clear or everywhere) and bool(gain.sum() > _WORTH * before.sum())
 
-
-def signed_rank(gain: Tensor) -> float:
-    """How many standard errors paired gains are above none, by their ranks (Wilcoxon, 1945).
-
-    A mean of gains and its standard error are blunted by a few windows, such as those near a stop
-    or those that met a disturbance, in which both models are far off. Ranks are not.
-
-    Args:
-        gain: differences ``[W]``. Those that are zero do not count.
-
-    Returns:
-        The sum of the ranks of their sizes, with their signs, over its standard deviation if either
-        sign were as likely; 0 where nothing differs.
-
-    Examples:
-        >>> gain = torch.tensor([0.5, 0.4, 0.0, -0.1, 0.6, 0.7, -90.0])
-        >>> round(signed_rank(gain), 2)  # ranks 3, 2, -1, 4, 5, -6
-        0.73
-        >>> round(signed_rank(gain.abs()), 2), signed_rank(torch.zeros(3))
-        (2.2, 0.0)
-    """
-    gain = gain[gain != 0]
-    if not len(gain):
-        return 0.0
-    rank = gain.abs().argsort().argsort().to(gain) + 1.0
-    return float((gain.sign() * rank).sum() / rank.square().sum().sqrt())
+    def _is_exact(self, sigma: Tensor) -> bool:
+        """Whether nothing is left but rounding, which no model explains."""
+        mask, measured = self.windows.mask, self.windows.measured
+        seen = mask.any(0).any(0).nonzero().flatten().tolist()
+        spreads = {i: measured[..., i][mask[..., i]].std() for i in seen}
+        return all(bool(sigma[i] < _EXACT * spread) for i, spread in spreads.items())

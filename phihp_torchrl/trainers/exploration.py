@@ -109,6 +109,7 @@ class Exploration:
 
     def __init__(self, task: Task, config: ExplorationConfig) -> None:
         self.task, self.config = task, config
+        self._shown = task.observation_dim  # what a controller sees, whatever is appended later
         self._controller: Controller | None = None
         self._last: Tensor | None = None
         self._trim = self._read_trim()
@@ -137,7 +138,7 @@ class Exploration:
         if _starts(tensordict) and hasattr(self._controller, "reset"):
             self._controller.reset()
         try:
-            given = self._controller(tensordict["observation"].float())
+            given = self._controller(tensordict["observation"][..., : self._shown].float())
             action = torch.as_tensor(given, dtype=torch.float32)
         # A user's function may raise anything; the message should name it and the reason.
         except Exception as error:

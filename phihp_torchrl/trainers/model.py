@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -11,6 +12,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import Compose, TransformedEnv
 
 from phihp_torchrl.config import (
     ConfigError,
@@ -32,7 +34,7 @@ from phihp_torchrl.dynamics import (
 )
 from phihp_torchrl.imagination import Batch
 from phihp_torchrl.recordings import transitions
-from phihp_torchrl.tasks import Task
+from phihp_torchrl.tasks import Actuator, Task
 from phihp_torchrl.trainers.collect import (
     drop_unusable,
     planning_policy,
@@ -42,10 +44,12 @@ from phihp_torchrl.trainers.collect import (
 )
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.exploration import Exploration
+from phihp_torchrl.trainers.lateness import Lateness
 from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
 from phihp_torchrl.trainers.phases import Phase, register_phase
 from phihp_torchrl.worlds import (
     World,
+    command_memory,
     crossings_text,
     disagreements,
     guard_env,
@@ -67,6 +71,10 @@ class ModelTrainer:
 
     Steps of which a number is missing are left out, with a warning. A run saves new steps before it
     fits the model to them, so that a fit that fails costs no step.
+
+    Where the task has no actuator and previous commands explain what the first or the last fit
+    leaves over, a dead time and a lag are chosen by held-out error. :attr:`task` and :attr:`world`
+    then have them, and later phases of a run go on with these.
 
     Args:
         task: the task.
@@ -102,6 +110,7 @@ class ModelTrainer:
             guards = config.collect.exploration.guards
             self.env = guard_env(self.world.make_env(), task, guards, self.crossings)
         self.recorded = _recorded(self.world)
+        self.lateness = Lateness(task, self.world, config.actuator, config.fit)
         self.generator = torch.Generator().manual_seed(seed)
         self.dynamics = make_dynamics(self.world, config, self.generator)
         self.initial = {k: v.clone() for k, v in self.dynamics.state_dict().items()}
@@ -112,6 +121,7 @@ class ModelTrainer:
         """What saves the run; it is called when there are new real steps."""
         self._new, self._dropped = 0, 0  # steps not yet fitted, and those left out
         self._told: set[str] = set()
+        self._found: Actuator | None = None
         seed_of_env = self._draw_seed()
         if self.env is not None:
             self.env.set_seed(seed_of_env)
@@ -233,6 +243,8 @@ class ModelTrainer:
             ),
             batch_size=[steps],
         ).detach()
+        if self.lateness.open:
+            data["step_count"] = rollout["step_count"]
         data, dropped = drop_unusable(data)
         self._dropped += dropped
         return data
@@ -263,16 +275,19 @@ class ModelTrainer:
         """Fit the model to all data and measure it."""
         config = self.config.fit
         if not self.config.warm_start:
-            self.dynamics.load_state_dict(self.initial)
-            self.loss.lambda_.fill_(self.config.lambda_0)
+            self._begin_again()
         elif self.iteration > 1 and not self._has_all:
             config = replace(
                 config,
                 steps=min(config.steps, self.config.refit_steps),
                 initial_lambda=config.final_lambda,
             )
+        assert self.data is not None
         train, held_out, blocks = split(self.data)
         report = self._fit(train, held_out, config)
+        if self._finds_actuator(report):
+            train, held_out, blocks = split(self.data)
+            report = self._fit(train, held_out, self.config.fit)
         if config.method != "multiple_shooting" and report.held_out_error > 1e-4:
             self._tell_noise(train)
         state, action, _ = self.loss.transitions(train)
@@ -291,6 +306,35 @@ class ModelTrainer:
             for name, value in self.task.system.identifiable(constants).items():
                 metrics[f"constants/{name}"] = value.detach()
         return metrics
+
+    def _finds_actuator(self, report: FitReport) -> bool:
+        """Whether a fit shows that commands act late, and how; their path is then the task's."""
+        assert self.data is not None
+        if not self.lateness.suspected(self.loss, self.data, report.held_out_error):
+            return False
+        found = self.lateness.find(self.loss, self.data, self.generator, self._begin_again)
+        if found is None:
+            return False
+        self._dropped += len(self.data) - len(found.data)
+        self.data = found.data
+        self._take_actuator(found.actuator)
+        return True
+
+    def _begin_again(self) -> None:
+        self.dynamics.load_state_dict(self.initial)
+        self.loss.lambda_.fill_(self.config.lambda_0)
+
+    def _take_actuator(self, actuator: Actuator) -> None:
+        """Go on with a task that has an actuator, in a world that shows what is under way."""
+        self.lateness.open, self._found = False, actuator
+        self.task = task = replace(self.task, actuator=actuator)
+        self.world = copy.copy(self.world)  # not the user's own
+        self.world.task = self.dynamics.task = self.exploration.task = task
+        if self.env is not None:
+            memory = Compose(*command_memory(task))
+            self.env = TransformedEnv(self.env, memory, auto_unwrap=False)
+        else:
+            self.recorded = _recorded(self.world)
 
     def _tell_noise(self, data: TensorDict) -> None:
         """Warn, once, where sensor noise dominates the errors of single steps."""
@@ -324,6 +368,7 @@ class ModelTrainer:
             "loss": {name: buffer for name, buffer in self.loss.named_buffers(recurse=False)},
             "data": None if self.data is None else self.data.to_dict(),
             "solver": self._solver(),
+            "actuator": None if self._found is None else self._found.config,
             "iteration": self.iteration,
             "new": self._new,
             "dropped": self._dropped,
@@ -332,12 +377,15 @@ class ModelTrainer:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a :meth:`state_dict`."""
+        if (actuator := state.get("actuator")) is not None:
+            self._take_actuator(Actuator(**actuator))
         self.dynamics.load_state_dict(state["dynamics"])
         self.initial = dict(state["initial"])
         for name, value in state["loss"].items():
             self.loss.get_buffer(name).copy_(value)
         data = state["data"]
         self.data = None if data is None else TensorDict(data).auto_batch_size_(1)
+        self.lateness.open &= data is None or "step_count" in data
         self.iteration = state["iteration"]
         if (solver := state.get("solver")) is not None:
             self.dynamics.integrator = SOLVERS[solver]

@@ -27,6 +27,7 @@ from phihp_torchrl.integrators import check_integrator, has_substeps, integrator
 from phihp_torchrl.trainers.collect import (
     CollectConfig,
 )
+from phihp_torchrl.trainers.lateness import CHOICES
 from phihp_torchrl.worlds import (
     SimulatedWorld,
     World,
@@ -57,6 +58,9 @@ class ModelConfig:
         integrator: integrator of the model, semi_implicit_euler, rk4 or dopri5; or auto, for the
             cheapest one with fixed steps that predicts held-out transitions about as well as any.
         substeps: solver steps in a control step; 1 for dopri5 and auto, which choose their steps.
+        actuator: auto to choose dead time and lag of the commands by held-out error, where the task
+            has no actuator and previous commands explain the model's errors; none to choose
+            nothing.
         lambda_0: initial λ of the published loss, which divides the weight of ‖F^r‖.
         tau_ph: growth of λ with the prediction error.
         warm_start: whether a fit starts from the previous one. The fits between the first and the
@@ -84,6 +88,7 @@ class ModelConfig:
     ensemble: int = 1
     integrator: str = AUTO
     substeps: int = 1
+    actuator: str = AUTO
     lambda_0: float = 1e3
     tau_ph: float = 1e3
     warm_start: bool = True
@@ -105,6 +110,7 @@ class ModelConfig:
             )
         check_choice(self, "residual_outputs", RESIDUAL_OUTPUTS)
         check_choice(self, "activation", _ACTIVATIONS)
+        check_choice(self, "actuator", CHOICES)
         if self.integrator != AUTO:
             check_integrator(self)
         elif self.substeps != 1:

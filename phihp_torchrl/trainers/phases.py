@@ -16,8 +16,10 @@ class Phase(Protocol):
     A phase may also have an attribute ``real_steps``, the number of real steps that it has taken; a
     method ``parts``, which returns modules as keyword arguments of :class:`~phihp_torchrl.Agent`,
     or a whole agent as ``agent``; an attribute ``new_files``, a list of ``(label, path)`` of files
-    for the logger; and an attribute ``keep``, which the run sets to a function that saves a
-    checkpoint, for the phase to call within a unit of work when it has what must not be lost.
+    for the logger; an attribute ``world``, the :class:`~phihp_torchrl.worlds.World` with which
+    later phases go on, where the phase has found out more of its task; and an attribute ``keep``,
+    which the run sets to a function that saves a checkpoint, for the phase to call within a unit of
+    work when it has what must not be lost.
 
     Examples:
         >>> class Count:

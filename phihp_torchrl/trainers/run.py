@@ -163,11 +163,15 @@ class _Run:
         return RunResult(self.directory.path, finished, self.interrupt.signal, self.latest)
 
     def _make_phase(self, name: str) -> Phase:
+        world = self.world
+        for phase in self.phases.values():  # one may have found out more of the world's task
+            known = getattr(phase, "world", None)
+            world = known if isinstance(known, World) else world
         context = Context(
             config=self.config,
-            settings=resolve_seconds(self.config.section(name), self.world.task.time_step),
-            task=self.world.task,
-            world=self.world,
+            settings=resolve_seconds(self.config.section(name), world.task.time_step),
+            task=world.task,
+            world=world,
             before=dict(self.phases),
             directory=self.directory,
         )

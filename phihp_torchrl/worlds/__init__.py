@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from phihp_torchrl.worlds.agreement import disagreements
 from phihp_torchrl.worlds.base import World
+from phihp_torchrl.worlds.command_memory import command_memory
 from phihp_torchrl.worlds.guards import (
     GuardedWorld,
     crossings_text,

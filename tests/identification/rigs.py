@@ -50,6 +50,15 @@ class Mass(System):
         return torch.stack([state[..., 1], c["gain"] * action[..., 0] - pull], -1)
 
 
+class Undamped(Mass):
+    """The same, as one may write it who forgets the damping."""
+
+    default_constants = {"gain": 1.0, "stiffness": 4.0}
+
+    def prior(self, state: Tensor, action: Tensor, constants: dict) -> Tensor:
+        return super().prior(state, action, {**constants, "damping": 0.0})
+
+
 ROD = {"mass": 0.24, "length": 0.36, "gain": 0.03, "viscous": 0.016}
 MASS = {"gain": 1.3, "stiffness": 6.0, "damping": 0.5}
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from phihp_torchrl.dynamics import signed_rank
 from phihp_torchrl.identification import identify
-from phihp_torchrl.identification.trials import signed_rank
 from phihp_torchrl.tasks import Actuator
 from tests.identification.rigs import MASS, ROD, Mass, Rod, make_task, record
 
