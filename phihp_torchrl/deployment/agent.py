@@ -92,8 +92,6 @@ class Agent(TensorDictModuleBase):
         self.qvalue = qvalue
         if planner_config is not None:
             planner_config = resolve_seconds(planner_config, task.time_step)
-        if planner_config is not None:
-            planner_config = resolve_seconds(planner_config, task.time_step)
         self.planner_config = planner_config
         self.metadata = dict(metadata or {})
         self._memory = UnderWay(task) if task.register_count else None
