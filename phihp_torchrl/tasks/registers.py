@@ -19,10 +19,17 @@ class Part(ABC):
     first part acts on the system directly. Registers are moved once a step and never integrated.
     Whatever a task adds, such as commands under way or the last action, is a subclass; a task makes
     its parts in :meth:`phihp_torchrl.Task.parts`, and everything above reads them through it.
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> from phihp_torchrl import get_task
+        >>> task = replace(get_task("pendulum"), action_rate_cost=0.1)
+        >>> [(part.name, part.size) for part in task.parts()]
+        [('last action', 1)]
     """
 
     name: str
-    """What the part is called in messages and where parts of two tasks are matched."""
+    """What the part is called."""
     past: int = 0
     """The number of last commands that :meth:`random` needs."""
 
