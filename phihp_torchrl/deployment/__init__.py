@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from phihp_torchrl.deployment.agent import Agent
+from phihp_torchrl.deployment.c_source import export_c
 from phihp_torchrl.deployment.control_report import ControlReport
 from phihp_torchrl.deployment.controller import Controller
-from phihp_torchrl.deployment.export import (
-    PlanModule,
-    export_aoti,
-    export_onnx,
-    largest_differences,
-)
+from phihp_torchrl.deployment.export import export_aoti, export_onnx, largest_differences
+from phihp_torchrl.deployment.export_modules import ActorModule, PlanModule
+from phihp_torchrl.deployment.exported import ExportedAgent, load_exported
 from phihp_torchrl.deployment.files import AGENT_KINDS, load_agent, register_agent, save_agent
 from phihp_torchrl.deployment.formats import TaskSignature
 from phihp_torchrl.deployment.observer import VelocityObserver
@@ -26,8 +24,10 @@ __all__ = [
     "Safety",
     "VelocityObserver",
     "export_aoti",
+    "export_c",
     "export_onnx",
     "load_agent",
+    "load_exported",
     "register_agent",
     "run_realtime",
     "save_agent",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,11 +14,16 @@ from phihp_torchrl import get_task, save_agent
 from phihp_torchrl.agents import Actor, TwinQ
 from phihp_torchrl.commands import main
 from phihp_torchrl.deployment import (
+    ActorModule,
+    AgentError,
+    Controller,
     PlanModule,
     export_aoti,
     export_onnx,
     largest_differences,
+    load_exported,
 )
+from phihp_torchrl.deployment.manifest import Manifest
 from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
@@ -60,6 +66,8 @@ def test_aot_inductor(tmp_path):
     act = export_aoti(module, tmp_path / "plan.pt2")
     assert (tmp_path / "plan.pt2").is_file()
     assert largest_differences(act, module, observations(agent)).max() < 1e-4
+    loaded = load_exported(tmp_path / "plan.pt2")
+    assert loaded(TensorDict(observation=observations(agent, 1)[0]))["action"].shape == (1,)
 
 
 @pytest.mark.slow
@@ -97,8 +105,52 @@ def test_what_cannot_be_exported():
 def test_the_command_says_what_failed(tmp_path, monkeypatch, capsys):
     save_agent(make_agent(), tmp_path / "agent")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    words = [f"agent={tmp_path / 'agent'}", f"out={tmp_path / 'out'}", "formats=[onnx]", "states=5"]
-    main(words, command="export")
+    words = [f"agent={tmp_path / 'agent'}", f"out={tmp_path / 'out'}", "states=5"]
+    main([*words, "formats=[onnx,c]"], command="export")
     output = capsys.readouterr().out
-    assert "onnx: not written: ImportError" in output
-    assert "| eager |" in output
+    assert output.count("onnx: not written: ImportError") == 2
+    assert "| eager plan |" in output
+    assert "| eager actor |" in output
+    assert (tmp_path / "out" / "actor.c").is_file()
+    main([*words, "format=c", "parts=[actor]"], command="export")
+    assert "plan" not in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_actor_as_onnx_is_loaded_again_where_it_fits(tmp_path):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    agent = make_agent(LOPSIDED)
+    module, path = ActorModule(agent), tmp_path / "actor.onnx"
+    act = export_onnx(module, path)
+    assert largest_differences(act, module, observations(agent)).max() < 1e-5
+    with pytest.raises(AgentError, match="Register the task first"):
+        load_exported(path)
+    loaded = load_exported(path, LOPSIDED)
+    seen = observations(agent, 1)[0]
+    found = loaded(TensorDict(observation=seen))["action"]
+    torch.testing.assert_close(found, act(seen))
+    assert Controller(loaded).step(seen).tolist() == found.tolist()
+    with pytest.raises(ValueError, match=r"^observation: expected finite numbers of shape \[3\]"):
+        loaded(TensorDict(observation=seen * torch.nan))
+    with pytest.raises(AgentError, match=r"\['time_step'\] differ"):
+        load_exported(path, replace(LOPSIDED, time_step=0.02))
+    path.write_bytes(path.read_bytes() + b" ")
+    with pytest.raises(AgentError, match="got another"):
+        load_exported(path, LOPSIDED)
+
+
+def test_machine_code_for_another_machine_is_refused(tmp_path):
+    path = tmp_path / "plan.pt2"
+    path.write_bytes(b"code")
+    manifest = Manifest.of(PlanModule(make_agent()), path)
+    manifest.write(path)
+    assert Manifest.read(path) == manifest
+    manifest.check(path, machine_code=True)
+    others = {"torch_version": "1.0", "platform": "Other cpu", "processor": ("avx9000",)}
+    for name, value in others.items():
+        replace(manifest, **{name: value}).write(path)
+        with pytest.raises(AgentError, match="export the agent again on this machine"):
+            load_exported(path)
+    with pytest.raises(AgentError, match=r"expected one of \['.pt2', '.onnx'\]"):
+        load_exported(tmp_path / "plan.pt2.json")

@@ -16,7 +16,7 @@ from tests.docs.blocks import BLOCKS, PAGES, SHELLS, Block, commands
 from tests.docs.commands import check_command
 from tests.docs.conftest import TINY
 
-LANGUAGES = ("python", "yaml", "text", "bibtex", *SHELLS)
+LANGUAGES = ("python", "yaml", "c", "cpp", "text", "bibtex", *SHELLS)
 PLAIN = {"planner.num_policy_candidates": 0}
 WIDTH = 84
 """Characters that a line of code has room for on a page."""

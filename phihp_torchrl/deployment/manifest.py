@@ -1,0 +1,155 @@
+"""What stands beside an exported file: what it takes, for which task, and where it runs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from phihp_torchrl.deployment.export_modules import ExportModule
+from phihp_torchrl.deployment.formats import TaskSignature
+from phihp_torchrl.deployment.reading import AgentError, read_json
+from phihp_torchrl.origin import package_version
+from phihp_torchrl.tasks import Task
+
+FORMAT = "phihp_torchrl export"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The description of an exported file, kept as JSON beside it.
+
+    Args:
+        format: what sort of JSON file this is.
+        part: ``"plan"`` or ``"actor"``.
+        task: signature of the task.
+        actuator: numbers of the task's actuator that are not those of a perfect one.
+        observation: number of components of an observation.
+        noise: shape of the noise, or ``None``.
+        sha256: digest of the exported file.
+        package_version: version of this package that wrote it.
+        torch_version: version of torch that wrote it, without its build.
+        platform: operating system and processor family.
+        processor: instructions of the processor, for machine code that needs them.
+    """
+
+    format: str
+    part: str
+    task: Mapping[str, Any]
+    actuator: Mapping[str, Any]
+    observation: int
+    noise: tuple[int, ...] | None
+    sha256: str
+    package_version: str
+    torch_version: str
+    platform: str
+    processor: tuple[str, ...]
+
+    @classmethod
+    def of(cls, module: ExportModule, path: Path) -> Manifest:
+        """Describe the file that was exported from a module here."""
+        task = module.task
+        return cls(
+            format=FORMAT,
+            part=module.part,
+            task=signature_of(task),
+            actuator={} if task.actuator is None else task.actuator.config,
+            observation=task.observation_dim,
+            noise=module.noise_shape,
+            sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+            package_version=package_version(),
+            torch_version=torch_version(),
+            platform=platform_name(),
+            processor=processor(),
+        )
+
+    def write(self, path: Path) -> None:
+        """Write it beside the exported file."""
+        manifest_path(path).write_text(json.dumps(asdict(self), indent=2) + "\n")
+
+    @classmethod
+    def read(cls, path: Path) -> Manifest:
+        """Read the description of an exported file.
+
+        Raises:
+            AgentError: if it is missing, or is not such a description.
+        """
+        place = manifest_path(path)
+        content = read_json(place)
+        names = {field.name for field in fields(cls)}
+        if content.get("format") != FORMAT or set(content) != names:
+            raise AgentError(f"{place}: expected the description of an exported file, got another.")
+        try:
+            content["noise"] = None if content["noise"] is None else tuple(content["noise"])
+            content["processor"] = tuple(content["processor"])
+        except TypeError as error:
+            raise AgentError(f"{place}: expected lists of numbers and names: {error}.") from error
+        return cls(**content)
+
+    def check(self, path: Path, *, machine_code: bool) -> None:
+        """Refuse a file that is another one, or machine code that does not run here.
+
+        Raises:
+            AgentError: naming what differs.
+        """
+        if hashlib.sha256(path.read_bytes()).hexdigest() != self.sha256:
+            raise AgentError(
+                f"{path}: expected the file that {manifest_path(path).name} describes, got another."
+            )
+        if not machine_code:
+            return
+        here = {"torch_version": torch_version(), "platform": platform_name()}
+        for name, value in here.items():
+            if getattr(self, name) != value:
+                raise AgentError(
+                    f"{path}: it was made for {name} {getattr(self, name)!r}, here is {value!r}; "
+                    "export the agent again on this machine."
+                )
+        if missing := sorted(set(self.processor) - set(processor())):
+            raise AgentError(
+                f"{path}: it was made for a processor with {', '.join(missing)}, which this one "
+                "lacks; export the agent again on this machine."
+            )
+
+
+def signature_of(task: Task) -> dict[str, Any]:
+    """The signature of a task as JSON has it."""
+    return json.loads(json.dumps(asdict(TaskSignature.of(task))))
+
+
+def manifest_path(path: Path) -> Path:
+    """Where the description of an exported file is."""
+    return path.with_name(f"{path.name}.json")
+
+
+def torch_version() -> str:
+    """The version of torch, without its build."""
+    return torch.__version__.split("+")[0]
+
+
+def platform_name() -> str:
+    """Operating system and processor family, such as ``Linux x86_64``."""
+    return f"{platform.system()} {platform.machine()}"
+
+
+def processor() -> tuple[str, ...]:
+    """The vector instructions of this processor, by the names that Linux gives them.
+
+    Elsewhere there are none, and only the family is compared.
+    """
+    prefixes = ("avx", "fma", "amx", "sse4", "f16c", "bmi", "sve", "asimd")
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        return ()
+    for line in text.splitlines():
+        name, _, words = line.partition(":")
+        if name.strip() in ("flags", "Features"):
+            return tuple(sorted(word for word in set(words.split()) if word.startswith(prefixes)))
+    return ()
