@@ -122,7 +122,8 @@ def get_method(name: str) -> Method:
 
 
 _IMAGINED = ("model", "policy", "evaluate")
-_REAL = ("model", "td3", "evaluate")
+_HYBRID = ("model", "policy", "calibrate", "evaluate")
+_REAL = ("model", "td3", "calibrate", "evaluate")
 _PLANNED = ("model", "evaluate")
 
 # Plain CEM has no Q beyond its horizon, so it looks further ahead and discounts nothing.
@@ -144,7 +145,7 @@ register_method(
     Method(
         "PhIHP",
         "a hybrid model, actor and Q in imagination, planning with all three",
-        _IMAGINED,
+        _HYBRID,
         group="ours",
         samples_key="model.real_steps",
     ),

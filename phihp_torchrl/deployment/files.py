@@ -131,7 +131,7 @@ def save_agent(
 def load_agent(
     directory: str | os.PathLike[str],
     *,
-    planner: bool = True,
+    planner: bool | None = None,
     task: str | Task | None = None,
     device: torch.device | str | None = None,
     compile: bool | dict[str, Any] = False,
@@ -143,7 +143,8 @@ def load_agent(
 
     Args:
         directory: the directory that :func:`save_agent` wrote.
-        planner: whether it plans; ``False`` is the actor alone.
+        planner: whether it plans; ``False`` is the actor alone. By default it plans, unless its
+            metadata say ``"acting": "actor"``: calibration found no plan that beats its actor.
         task: the task that it must be for: a name, or a task that need not be registered.
         device: device of the agent. Defaults to the CPU.
         compile: whether to compile the plan.
@@ -191,7 +192,7 @@ def load_agent(
             task,
             content,
             parts,
-            use_planner=planner,
+            use_planner=_plans(content) if planner is None else planner,
             compile=compile,
             metadata=content["metadata"],
         )
@@ -215,6 +216,10 @@ def _read_signature(mapping: Mapping[str, Any]) -> TaskSignature:
         key: tuple(value) if isinstance(value, list) else value for key, value in mapping.items()
     }
     return TaskSignature(**values)
+
+
+def _plans(content: Mapping[str, Any]) -> bool:
+    return content["metadata"].get("acting") != "actor"
 
 
 def _check_format(path: Path, content: dict[str, Any]) -> None:

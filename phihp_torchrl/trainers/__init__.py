@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.trainers.calibrate import CalibrateConfig, CalibratePhase
 from phihp_torchrl.trainers.collect import CollectConfig, Policy, planning_policy, random_policy
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.evaluate import EvaluateConfig, EvaluatePhase
@@ -38,6 +39,8 @@ from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
 from phihp_torchrl.trainers.td3 import RealTD3Config, RealTD3Trainer
 
 __all__ = [
+    "CalibrateConfig",
+    "CalibratePhase",
     "CollectConfig",
     "Context",
     "EvaluateConfig",

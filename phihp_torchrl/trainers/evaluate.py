@@ -194,6 +194,7 @@ class EvaluatePhase:
             "samples": self.samples,
             "config": _public(self.config.to_mapping()),
             "returns": self.results,
+            **self.agent.metadata,
         }
         save_agent(self.agent, self.directory.agent, metadata=metadata)
         results = {**self.results, **({BASELINES_KEY: beside} if beside else {})}
@@ -219,7 +220,8 @@ def _build(context: Context) -> Phase:
         parts |= getattr(phase, "parts", dict)()
     config, agent = context.config, parts.get("agent")
     if agent is None:
-        agent = Agent(context.task, **parts, planner_config=config.planner, compile=config.compile)
+        parts = {"planner_config": config.planner, "compile": config.compile, **parts}
+        agent = Agent(context.task, **parts)
     world, samples = context.world, real_steps(context.before)
     collect = getattr(config.sections.get("model"), "collect", None)
     guards = collect.exploration.guards if isinstance(collect, CollectConfig) else {}

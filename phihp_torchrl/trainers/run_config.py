@@ -78,7 +78,7 @@ class RunConfig:
         >>> from phihp_torchrl import load_config
         >>> config = read_run_config(load_config("pendulum", overrides=["policy.updates=100"]))
         >>> config.section("policy").updates, config.phases
-        (100, ('model', 'policy', 'evaluate'))
+        (100, ('model', 'policy', 'calibrate', 'evaluate'))
     """
 
     task: str

@@ -51,7 +51,7 @@ def test_a_method_composes_to_what_it_says(name: str) -> None:
 
 
 def test_sections_are_the_phases_and_the_planner_of_those_that_plan() -> None:
-    assert get_method("phihp").sections == ("model", "policy", "evaluate", "planner")
+    assert get_method("phihp").sections == ("model", "policy", "calibrate", "evaluate", "planner")
     assert get_method("td3").sections == ("td3", "evaluate")
     assert get_method("td-mpc").sections == ("tdmpc", "evaluate")
     assert [name for name in PAPERS if not get_method(name).plans] == [

@@ -8,7 +8,7 @@ from phihp_torchrl.config import METHODS, YAML
 from phihp_torchrl.tdmpc import ScheduledMPPIConfig, TDMPCConfig, TDMPCTrainConfig, TOLDConfig
 from phihp_torchrl.trainers import RunConfig
 
-from .run_parts import CONFIG, EVALUATE, MODEL, POLICY
+from .run_parts import CALIBRATE, CONFIG, EVALUATE, MODEL, POLICY
 from .trainer_parts import REAL
 
 TASKS = sorted(path.stem for path in (YAML / "task").glob("*.yaml"))
@@ -48,6 +48,7 @@ def small(method: str, task: str = CONFIG.task) -> RunConfig:
         "policy": POLICY,
         "td3": REAL,
         "tdmpc": TDMPC,
+        "calibrate": CALIBRATE,
         "evaluate": EVALUATE,
     }
     return replace(

@@ -16,6 +16,7 @@ from phihp_torchrl.dynamics import FitConfig
 from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.tasks import get_task, register_task
 from phihp_torchrl.trainers import (
+    CalibrateConfig,
     CollectConfig,
     EvaluateConfig,
     ModelConfig,
@@ -49,6 +50,7 @@ POLICY = PolicyConfig(
     td3=TD3Config(actor_hidden_sizes=(8,), critic_hidden_sizes=(8,)),
     refit=RefitConfig(interval=0),
 )
+CALIBRATE = CalibrateConfig(enabled=False)  # it has tests of its own
 EVALUATE = EvaluateConfig(episodes=2, latency_actions=0, video=False, baselines="none")
 CONFIG = RunConfig(
     task="brief-pendulum",
@@ -58,7 +60,7 @@ CONFIG = RunConfig(
     planner=CEMConfig(
         planning_horizon=2, optim_steps=1, num_candidates=8, top_k=2, num_policy_candidates=2
     ),
-    sections={"model": MODEL, "policy": POLICY, "evaluate": EVALUATE},
+    sections={"model": MODEL, "policy": POLICY, "calibrate": CALIBRATE, "evaluate": EVALUATE},
 )
 
 

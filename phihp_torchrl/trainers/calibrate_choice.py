@@ -1,0 +1,142 @@
+"""Which settings of the planner are compared, and which of them is chosen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.planners import SearchConfig
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The measure of one setting against the actor, over paired imagined starts.
+
+    Args:
+        changes: what the setting changes in the planner's.
+        steps: steps that were planned before the actor took over.
+        differences: return minus that of the actor from the same start, ``[2, episodes]``: from the
+            task's starts, and from the second half of the actor's episodes.
+        chatter: mean change of the action in units of the half-range, from the second half on.
+
+    Examples:
+        >>> trial = Trial({}, 10, ((1.0, 3.0), (0.0, 0.0)), 0.1)
+        >>> trial.mean, trial.standard_error
+        (2.0, 1.0)
+    """
+
+    changes: Mapping[str, Any]
+    steps: int
+    differences: tuple[tuple[float, ...], ...]
+    chatter: float
+
+    @property
+    def mean(self) -> float:
+        """Gain over the actor from both sorts of starts; -inf where a return is not finite."""
+        return estimate(torch.tensor(self.differences, dtype=torch.float64))[0]
+
+    @property
+    def standard_error(self) -> float:
+        """Standard error of :attr:`mean`."""
+        return estimate(torch.tensor(self.differences, dtype=torch.float64))[1]
+
+
+def estimate(differences: Tensor) -> tuple[float, float]:
+    """Sum of the means of rows ``[sorts, episodes]``, and its standard error."""
+    if not differences.isfinite().all():
+        return -math.inf, 0.0
+    variance = differences.var(-1).sum() / differences.shape[-1]
+    return differences.mean(-1).sum().item(), variance.sqrt().item()
+
+
+def rank(trials: Sequence[Trial]) -> list[Trial]:
+    """Sort settings, best first.
+
+    Those whose gain is within one standard error of the best's come first, the smoothest of them
+    before the others; then those that are worse, by their gain. Chatter is compared to two digits,
+    and of equally smooth settings the one of the larger gain comes first.
+
+    Examples:
+        >>> jumpy = Trial({}, 10, ((1.0, 2.1, 3.0), (0.0, 0.0, 0.0)), 0.4)
+        >>> smooth = Trial({"change_cost": 1.0}, 10, ((1.1, 1.9, 3.0), (0.0, 0.0, 0.0)), 0.01)
+        >>> worse = Trial({"alpha": 0.0}, 10, ((-1.0, 0.0, 1.0), (0.0, 0.0, 0.0)), 0.0)
+        >>> [trial.chatter for trial in rank([jumpy, worse, smooth])]
+        [0.01, 0.4, 0.0]
+    """
+    best = max(trials, key=lambda trial: trial.mean)
+
+    def key(trial: Trial) -> tuple[float, ...]:
+        if not math.isfinite(trial.mean):
+            return (1.0, math.inf)
+        behind = best.mean - trial.mean
+        tied = behind <= best.standard_error
+        return (0.0, round(trial.chatter, 2), behind) if tied else (1.0, behind)
+
+    return sorted(trials, key=key)
+
+
+def grid(config: SearchConfig, promise: float, reward: float) -> list[dict[str, Any]]:
+    """The settings that are compared, as changes of ``config``; a key that it lacks is left out.
+
+    Margins are in units of ``promise``, prices of ``reward``, because both are in the task's units.
+
+    Args:
+        config: the planner's settings.
+        promise: what its plans promise beyond the actor where the actor has settled, in units of
+            return.
+        reward: mean absolute reward of the actor.
+
+    Examples:
+        >>> from phihp_torchrl.planners import CEMConfig
+        >>> [list(changes) for changes in grid(CEMConfig(), 1.0, 1.0)][:3]
+        [[], ['actor_margin'], ['actor_margin']]
+    """
+    promise, reward = _round(promise), _round(reward)
+    margin = {"actor_margin": promise}
+    smooth = {
+        "change_cost": reward,
+        "noise_beta": 2.0,
+        "warm_start": True,
+        "keep_incumbent": True,
+        "incumbent_margin": _round(promise / 10),
+    }
+    half = max(2, config.planning_horizon // 2)
+    wanted: list[dict[str, Any]] = [
+        {},
+        margin,
+        {"actor_margin": 2 * promise},
+        {"change_cost": _round(reward / 10)},
+        {"change_cost": reward},
+        {"change_cost": reward, "noise_beta": 2.0},
+        {"change_cost": reward, **margin},
+        smooth,
+        {**smooth, **margin},
+        {"alpha": config.alpha / 2, **margin},
+        {"planning_horizon": half, **margin},
+    ]
+    known = {field.name for field in fields(config)}
+    settings: list[dict[str, Any]] = []
+    for changes in wanted:
+        own = {key: value for key, value in changes.items() if key in known}
+        own = {key: value for key, value in own.items() if getattr(config, key) != value}
+        if own not in settings:
+            settings.append(own)
+    return [changes for changes in settings if _fits(config, changes)]
+
+
+def _fits(config: SearchConfig, changes: Mapping[str, Any]) -> bool:
+    try:
+        replace(config, **changes)
+    except ValueError:
+        return False
+    return True
+
+
+def _round(number: float) -> float:
+    """A number with two digits, so that a setting can be read."""
+    return float(f"{number:.2g}")

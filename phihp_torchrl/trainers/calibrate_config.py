@@ -1,0 +1,47 @@
+"""Settings of the phase that calibrates the planner in imagination."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from phihp_torchrl.config import ConfigError, check_count, check_not_negative, is_whole
+
+
+@dataclass(frozen=True)
+class CalibrateConfig:
+    """How the planner's settings are compared with the actor in imagined episodes.
+
+    Args:
+        enabled: whether to calibrate; false takes the settings of the section planner as they are.
+        episodes: paired imagined episodes, and as many starts in the second half of one.
+        rounds: steps that each setting plans before the actor takes over, in each round; after a
+            round the better half of the settings goes on.
+        follow_steps: steps of the actor after those.
+        confidence: standard errors by which a plan must beat the actor in whole episodes to act.
+
+    Raises:
+        ConfigError: for a value out of range; the message names the field.
+
+    Examples:
+        >>> CalibrateConfig(rounds=(20, 10))
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: rounds: expected rising whole numbers >= 2, got (20, 10).
+    """
+
+    enabled: bool = False
+    episodes: int = 6
+    rounds: tuple[int, ...] = (10, 20, 40)
+    follow_steps: int = 100
+    confidence: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.enabled, bool):
+            raise ConfigError("enabled", f"expected true or false, got {self.enabled!r}.")
+        check_count(self, "episodes", least=2)
+        check_count(self, "follow_steps", least=0)
+        check_not_negative(self, "confidence")
+        rounds = self.rounds
+        good = bool(rounds) and all(is_whole(steps, 2) for steps in rounds)
+        if not good or list(rounds) != sorted(set(rounds)):
+            raise ConfigError("rounds", f"expected rising whole numbers >= 2, got {rounds}.")
