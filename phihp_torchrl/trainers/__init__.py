@@ -13,6 +13,8 @@ from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_pha
 from phihp_torchrl.trainers.plugins import import_plugins
 from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.policy_config import PolicyConfig
+from phihp_torchrl.trainers.policy_phase import build_policy
+from phihp_torchrl.trainers.policy_search import PolicySearch
 from phihp_torchrl.trainers.record import record
 from phihp_torchrl.trainers.results import read_result
 from phihp_torchrl.trainers.run import RunResult, run
@@ -36,6 +38,7 @@ __all__ = [
     "ModelTrainer",
     "Phase",
     "PolicyConfig",
+    "PolicySearch",
     "PolicyTrainer",
     "RealTD3Config",
     "RealTD3Trainer",

@@ -18,6 +18,8 @@ class Phase(Protocol):
     or a whole agent as ``agent``; an attribute ``new_files``, a list of ``(label, path)`` of files
     for the logger; and an attribute ``keep``, which the run sets to a function that saves a
     checkpoint, for the phase to call within a unit of work when it has what must not be lost.
+    An attribute ``planner_changes`` has settings of the planner that go with its parts, and
+    ``summary`` plain values for the record of the run.
 
     Examples:
         >>> class Count:

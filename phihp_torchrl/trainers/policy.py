@@ -34,8 +34,6 @@ from phihp_torchrl.dynamics import (
 )
 from phihp_torchrl.imagination import Rollouts, Worlds, make_start_states
 from phihp_torchrl.tasks import Task
-from phihp_torchrl.trainers.context import Context
-from phihp_torchrl.trainers.phases import Phase, register_phase
 from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.td3_base import TD3Trainer
 from phihp_torchrl.worlds import World
@@ -335,22 +333,3 @@ def _draw(
         )
     # The draws have a generator of their own, so that everything else is as without them.
     return draw_shifts(covariance, config.num_worlds, torch.Generator().manual_seed(seed))
-
-
-def _build(context: Context) -> Phase:
-    config, model = context.config, context.before["model"]
-    settings = context.settings
-    measured = settings.draw_constants and settings.constants_std is None
-    return PolicyTrainer(
-        context.task,
-        model.dynamics,
-        settings,
-        world=context.world,
-        seed=config.seed,
-        data_states=model.states(),
-        compile=config.compile,
-        covariance=model.constants_covariance() if measured else None,
-    )
-
-
-register_phase("policy", PolicyConfig, _build, unit="updates")
