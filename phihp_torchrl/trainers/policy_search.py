@@ -22,8 +22,8 @@ from phihp_torchrl.trainers.strategies import AS_SET, STRATEGIES, strategies_of
 _log = logging.getLogger(__name__)
 
 # A way to learn is left half-way if nearly all starts are at the floor, for returns may still rise
-# late; at its end another is tried if most are.
-_HALF_WAY, _AT_END = 0.9, 0.5
+# late; at its end another is tried unless nearly all have left it.
+_HALF_WAY, _AT_END = 0.9, 0.15
 
 
 class _Found(NamedTuple):
@@ -43,7 +43,7 @@ class PolicySearch:
     At half of the updates of a way to learn, and at their end, the best actor so far plays in the
     model from starts that are the same for all ways. If it earns no more than an unskilled policy
     (:class:`~phihp_torchrl.trainers.floor.Floor`) from 90 % of the starts half-way, or from more
-    than half of them at the end, a warning says so, and the next strategy begins anew, with as many
+    than 15 % of them at the end, a warning says so, and the next strategy begins anew, with as many
     updates. The actor that earns most over all ways is kept.
 
     Args:
@@ -255,7 +255,7 @@ class PolicySearch:
         self.over = True
         if self.stuck:
             _log.warning(
-                "Imagined returns stayed at the floor from most starts with %s. Check that the "
+                "Imagined returns stayed at the floor from many starts with %s. Check that the "
                 "reward can be reached: give the task a coverage box that holds the way to it and "
                 "a goal box around it, or a reward that grows on the way.",
                 [name for name, _ in self.ways[: self.tried + 1]],
