@@ -8,7 +8,6 @@ from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.policy_search import PolicySearch
 
-
 LEAST_UPDATES = 2000
 """Updates below which nobody can say that a way to learn has failed: no other one is tried."""
 
