@@ -24,6 +24,7 @@ from phihp_torchrl.trainers.plugins import import_plugins
 from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.policy_phase import build_policy
+from phihp_torchrl.trainers.policy_search import PolicySearch
 from phihp_torchrl.trainers.record import record
 from phihp_torchrl.trainers.results import read_controllers, read_result
 from phihp_torchrl.trainers.run import RunResult, run
@@ -49,6 +50,7 @@ __all__ = [
     "ModelTrainer",
     "Phase",
     "PolicyConfig",
+    "PolicySearch",
     "PolicyTrainer",
     "RealTD3Config",
     "RealTD3Trainer",

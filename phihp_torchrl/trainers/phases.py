@@ -20,6 +20,8 @@ class Phase(Protocol):
     later phases go on, where the phase has found out more of its task; and an attribute ``keep``,
     which the run sets to a function that saves a checkpoint, for the phase to call within a unit of
     work when it has what must not be lost.
+    An attribute ``planner_changes`` has settings of the planner that go with its parts, and
+    ``summary`` plain values for the record of the run.
 
     Examples:
         >>> class Count:

@@ -55,6 +55,9 @@ class PolicyConfig:
             interval that the fit of the model leaves them.
         constants_std: standard deviation that takes the place of the fit's: of a free constant
             relative, of a bounded one of the logit of its place; null for the fit's.
+        strategies: what is tried where imagined returns stay at the floor: auto for all strategies
+            in turn, none, or a list of names, of further (longer horizons), goal and wide (other
+            starts).
         start: where imagined episodes start.
         td3: hyper-parameters of TD3; all methods have its networks and γ.
         analytic: hyper-parameters of policy gradients through the model.
@@ -90,6 +93,7 @@ class PolicyConfig:
     scales: str = "auto"
     draw_constants: bool = False
     constants_std: float | None = None
+    strategies: str | tuple[str, ...] = "auto"
     start: StartConfig = field(default_factory=StartConfig)
     td3: TD3Config = field(default_factory=TD3Config)
     analytic: AnalyticConfig = field(default_factory=AnalyticConfig)
@@ -109,6 +113,8 @@ class PolicyConfig:
         )
         check_choice(self, "method", LEARNERS)
         check_choice(self, "scales", ("auto", "none"))
+        if isinstance(self.strategies, str):
+            check_choice(self, "strategies", ("auto", "none"))
         check_share(self, "random_fraction", "decay")
         check_count(self, "random_steps", "real_evaluation_episodes", least=0)
         check_not_negative(self, "exploration_noise")

@@ -6,23 +6,37 @@ from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, register_phase
 from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.policy_config import PolicyConfig
+from phihp_torchrl.trainers.policy_search import PolicySearch
+
+LEAST_UPDATES = 2000
+"""Updates below which nobody can say that a way to learn has failed: no other one is tried."""
 
 
 def build_policy(context: Context) -> Phase:
-    """Build the phase; constants are drawn by the covariance that the fit of the model has left."""
+    """Build the phase; constants are drawn by the covariance that the fit of the model has left.
+
+    Other strategies are tried only in a phase of at least ``LEAST_UPDATES`` updates.
+    """
     config, model = context.config, context.before["model"]
     settings = context.settings
     measured = settings.draw_constants and settings.constants_std is None
-    return PolicyTrainer(
-        context.task,
-        model.dynamics,
-        settings,
-        world=context.world,
-        seed=config.seed,
-        data_states=model.states(),
-        compile=config.compile,
-        covariance=model.constants_covariance() if measured else None,
-    )
+    covariance = model.constants_covariance() if measured else None
+
+    def make(settings: PolicyConfig) -> PolicyTrainer:
+        return PolicyTrainer(
+            context.task,
+            model.dynamics,
+            settings,
+            world=context.world,
+            seed=config.seed,
+            data_states=model.states(),
+            compile=config.compile,
+            covariance=covariance,
+        )
+
+    if settings.strategies == "none" or settings.updates < LEAST_UPDATES:
+        return make(settings)
+    return PolicySearch(context.task, settings, make, seed=config.seed)
 
 
 register_phase("policy", PolicyConfig, build_policy, unit="updates")

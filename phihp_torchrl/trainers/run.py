@@ -233,6 +233,8 @@ class _Run:
         clear_rotation(self.directory.rotation)
         metadata["seconds"] = {k: round(v, 3) for k, v in self.position.seconds.items()}
         metadata["real_steps"] = self.position.real_steps
+        if hasattr(phase, "summary"):
+            metadata[name] = phase.summary
         self.directory.write_metadata(metadata)
 
     def _save(self, name: str, phase: Phase, path: Path | None = None) -> None:

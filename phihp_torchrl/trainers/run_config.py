@@ -28,7 +28,9 @@ from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.trainers.loggers import LoggerConfig
 from phihp_torchrl.trainers.phases import PHASES, unknown_phases
 from phihp_torchrl.trainers.plugins import import_plugins
+from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory
+from phihp_torchrl.trainers.strategies import strategies_of
 from phihp_torchrl.worlds import WORLDS, SimulatedConfig, World
 
 FREE_KEYS = ("checkpoint_interval", "keep_checkpoints", "progress", "logger")
@@ -335,6 +337,8 @@ def check_run(config: RunConfig, world: World) -> None:
                 f"expected one that does without acting in the world, {config.method!r} acts in it "
                 f"in {phases}, and {world} has recordings alone.",
             )
+    if isinstance(policy := config.sections.get("policy"), PolicyConfig):
+        strategies_of(policy)  # refuses unknown ones
     if getattr(config.sections.get("policy"), "draw_constants", False):
         _check_drawing(config, task)
     if world.truth is None:

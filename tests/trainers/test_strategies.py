@@ -1,0 +1,139 @@
+"""What the policy phase tries where imagined returns stay at the floor."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from phihp_torchrl import HybridDynamics, get_task
+from phihp_torchrl.agents import RefitConfig, TD3Config
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.tasks import Task
+from phihp_torchrl.trainers import PolicyConfig, PolicySearch, PolicyTrainer
+from phihp_torchrl.trainers.floor import Floor
+from phihp_torchrl.trainers.strategies import STRATEGIES, strategies_of
+
+TINY = PolicyConfig(
+    updates=8,
+    batch_size=8,
+    evaluation_interval=2,
+    evaluation_episodes=8,
+    random_steps=64,
+    td3=TD3Config(actor_hidden_sizes=(8,), critic_hidden_sizes=(8,)),
+    refit=RefitConfig(interval=0),
+)
+
+
+def sparse(reward: Any) -> Task:
+    return replace(get_task("pendulum"), max_steps=5, reward=reward)
+
+
+def never(state: torch.Tensor, action: torch.Tensor, next_state: torch.Tensor) -> torch.Tensor:
+    return torch.zeros_like(next_state[..., 0])
+
+
+def search(task: Task, config: PolicyConfig = TINY) -> PolicySearch:
+    torch.manual_seed(0)
+    model = HybridDynamics.hybrid(task)
+    return PolicySearch(
+        task, config, lambda settings: PolicyTrainer(task, model, settings, seed=0), seed=0
+    )
+
+
+def run(phase: PolicySearch) -> list[dict[str, float]]:
+    rows = []
+    while not phase.done:
+        rows.append(phase.advance())
+    return rows
+
+
+def test_a_reward_that_is_never_met_is_said_and_every_strategy_tried(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    phase = search(sparse(never))
+    rows = run(phase)
+    assert [row["policy/strategy"] for row in rows] == [0, 0, 1, 1, 2, 2]  # each left half-way
+    assert [row["policy/updates"] for row in rows] == [2, 4, 6, 8, 10, 12]
+    assert [row["policy/at_floor"] for row in rows if "policy/at_floor" in row] == [1, 1, 1]
+    assert phase.progress == (12, 16)
+    assert phase.summary["tried"] == ["as-set", "further", "wide"]  # it has no goal box
+    assert phase.summary["at_floor"]
+    warnings = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+    assert len(warnings) == 3
+    assert "Trying strategy 'further'" in warnings[0]
+    assert "Check that the reward can be reached" in warnings[2]
+
+
+def test_an_actor_above_the_floor_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares = iter([1.0, 0.2, 0.1])
+    monkeypatch.setattr(Floor, "share", lambda self, returns: next(shares))
+    phase = search(sparse(never), replace(TINY, td3=replace(TINY.td3, gamma=0.5)))
+    rows = run(phase)
+    assert [row["policy/strategy"] for row in rows] == [0, 0, 1, 1, 1, 1]
+    assert phase.summary == {"tried": ["as-set", "further"], "kept": "further", "at_floor": False}
+    assert phase.planner_changes == {"gamma": math.exp(-0.5)}  # the critics' discount
+
+
+def test_none_of_it_changes_what_is_learned_where_nothing_is_stuck(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    task = replace(get_task("pendulum"), max_steps=5)
+    torch.manual_seed(0)
+    alone = PolicyTrainer(task, HybridDynamics.hybrid(task), TINY, seed=0)
+    while not alone.done:
+        alone.advance()
+    phase = search(task, replace(TINY, strategies=("wide",)))
+    monkeypatch.setattr(Floor, "share", lambda self, returns: 0.0)
+    run(phase)
+    ours, theirs = phase.best_actor().state_dict(), alone.best_actor().state_dict()
+    assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+
+
+def test_a_stopped_search_goes_on_where_it_was() -> None:
+    whole = search(sparse(never))
+    expected = run(whole)
+    first = search(sparse(never))
+    for _ in range(3):
+        first.advance()
+    state, random = first.state_dict(), torch.get_rng_state()
+    again = search(sparse(never))
+    again.load_state_dict(state)
+    torch.set_rng_state(random)
+    rows = run(again)
+    keys = ("policy/strategy", "policy/updates", "policy/loss_qvalue")
+    for row, other in zip(rows, expected[3:], strict=True):
+        assert [row.get(key) for key in keys] == [other.get(key) for key in keys]
+    ours, theirs = again.best_actor().state_dict(), whole.best_actor().state_dict()
+    assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+
+
+def test_few_good_starts_do_not_hide_that_most_are_at_the_floor() -> None:
+    task = replace(get_task("pendulum"), max_steps=5)
+    model = TaskWorldModel(task, HybridDynamics.hybrid(task))
+    floor = Floor(model, task.reset.sample([10]), 5, seed=0)
+    returns = floor.returns.clone()
+    returns[:2] += 1000.0
+    assert floor.share(returns) == 0.8
+    assert floor.share(floor.returns + 1000.0) == 0.0
+    assert floor.share(floor.returns - 1000.0) == 1.0
+    assert floor.share(torch.full((10,), float("nan"))) == 1.0
+
+
+def test_strategies_keep_what_reaches_further_already() -> None:
+    far = replace(TINY, td3=replace(TINY.td3, gamma=0.999, value_expansion=9), max_age=7)
+    task = get_task("pendulum")
+    changed = STRATEGIES["further"].change(far, task)
+    assert changed == far  # so that it is not tried at all
+    assert "further" not in dict(search(sparse(never), far).ways)
+
+
+@pytest.mark.parametrize("strategies", ["always", ("further", "sideways")])
+def test_unknown_strategies_are_refused(strategies: Any) -> None:
+    with pytest.raises(ConfigError, match="strategies: expected"):
+        strategies_of(replace(TINY, strategies=strategies))
