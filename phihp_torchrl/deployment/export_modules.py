@@ -80,10 +80,11 @@ class PlanModule(ExportModule):
             )
         if not getattr(planner.env.tensor_model, "compiles", True):
             raise ConfigError("agent", "expected a model whose integrator compiles, got another.")
-        super().__init__(agent.task, planner.settings.noise_shape((), agent.task.action_dim))
+        shape = planner.settings.noise_shape((), agent.task.action_dim)
+        super().__init__(agent.task, shape)
         self.planner = planner  # whose parameters are then this module's
         # The first call keeps the filter of this shape, which an export then takes as a constant.
-        colored(torch.zeros(self.noise_shape), planner.settings.noise_beta, dim=1)
+        colored(torch.zeros(shape), planner.settings.noise_beta, dim=1)
 
     def forward(self, observation: Tensor, noise: Tensor) -> Tensor:
         """Return the first action of a plan, ``[m]``."""
