@@ -55,6 +55,27 @@ def test_the_fast_way_is_the_environments_way(name):
     assert torch.equal(fast.terminated, slow.terminated)
 
 
+@pytest.mark.parametrize("batch", [None, 2])
+def test_chatter_is_of_the_second_half_in_half_ranges(batch):
+    """Full swings in the first half do not count, and 2, 0, 2, 0 N of 10 N do; +99 N is 10 N."""
+    task = replace(get_task("cartpole-swingup"), max_steps=8)
+    plays = iter([99.0, -99.0, 99.0, -10.0, 2.0, 0.0, 2.0, 0.0] * 2)
+
+    def act(observation):
+        return torch.full_like(observation[..., :1], next(plays))
+
+    policy = TensorDictModule(act, ["observation"], ["action"])
+    env = None if batch is None else SimulatedWorld(task).make_batch([batch])
+    result = evaluate(policy, task, episodes=2, env=env)
+    half_range = task.bounds.scale.item()
+    expected = (12.0 + 2.0 + 2.0 + 2.0) / 4 / half_range
+    assert half_range == 10.0
+    assert result.chatter.tolist() == pytest.approx([expected] * 2)
+    assert result.summary()["chatter"] == pytest.approx(expected)
+    one_step = evaluate(constant(), replace(task, max_steps=1), episodes=2)
+    assert one_step.chatter.tolist() == [0.0, 0.0]
+
+
 def test_rewards_after_the_end_do_not_count():
     task = replace(
         get_task("cartpole"),
