@@ -25,8 +25,9 @@ class Estimate:
         estimate: the estimate; the guess where nothing was fitted.
         low: lower end of the 95 % interval; ``None`` where the data give none.
         high: its upper end.
-        verdict: ``"identified"``, ``"identified only if the equations are complete"``, ``"only in combination with ..."``, ``"not identified by these
-            data"``, ``"fixed"`` or ``"at its limit"``.
+        verdict: ``"identified"``, ``"identified only if the equations are complete"``, ``"only in
+            combination with ..."``, ``"not identified by these data"``, ``"fixed"`` or ``"at its
+            limit"``.
         advice: what would identify it, or what to do; empty where nothing is needed.
     """
 
