@@ -11,12 +11,16 @@ from phihp_torchrl.tasks.last_action import LastAction
 from phihp_torchrl.tasks.numbers import Numbers
 from phihp_torchrl.tasks.registers import Part, Registers
 from phihp_torchrl.tasks.registry import find_task, get_task, list_tasks, register_task
+from phihp_torchrl.tasks.signal import Signal
+from phihp_torchrl.tasks.trajectories import Trajectories
 
 __all__ = [
     "ActionBounds",
     "Actuator",
     "Box",
+    "Signal",
     "Task",
+    "Trajectories",
     "Transition",
     "get_task",
     "list_tasks",
