@@ -92,7 +92,7 @@ class Agent(TensorDictModuleBase):
         self.qvalue = qvalue
         self.planner_config = planner_config
         self.metadata = dict(metadata or {})
-        self._memory = UnderWay(task) if task.register_count else None
+        self._memory = UnderWay(task, dynamics) if task.register_count else None
         self.planner = None
         if use_planner and planner_config is not None:
             self.planner = self._make_planner(planner_config, compile)
@@ -114,6 +114,10 @@ class Agent(TensorDictModuleBase):
         episode starts (:class:`torchrl.envs.InitTracker`); without it, call :meth:`reset`. The same
         holds for a task with an actuator, if the observation is the system's alone: the agent then
         remembers the commands that are under way.
+
+        A task's reference and inputs are read from ``"reference"`` and ``"inputs"``, unless they
+        are in the observation: ``[*batch, k]``, or with their preview ``[*batch, rows, k]``. They
+        are needed where an episode starts; later steps keep the last value if the key is missing.
         """
         with torch.no_grad():
             if self._memory is not None and self._memory.is_asked(tensordict):

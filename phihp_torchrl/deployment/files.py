@@ -105,6 +105,7 @@ def save_agent(
         "kind": agent.kind,
         "task": asdict(TaskSignature.of(agent.task)),
         **({"actuator": actuator.config} if (actuator := agent.task.actuator) else {}),
+        **({"outside": outside} if (outside := _outside(agent.task)) else {}),
         **config,
         "weights_sha256": hashlib.sha256(data).hexdigest(),
         "metadata": dict(agent.metadata if metadata is None else metadata),
@@ -178,6 +179,11 @@ def load_agent(
         raise AgentError(f"{path}: {error}") from error
     task = _resolve_task(path, signature, task)
     task = _with_actuator(path, task, content.get("actuator"))
+    if (saved := content.get("outside", {})) != (ours := _outside(task)):
+        raise AgentError(
+            f"{path}: task {task.name!r} is another one here: expected the reference, inputs and "
+            f"disturbance {saved}, got {ours}."
+        )
     weights = _read_weights(directory / WEIGHTS_FILE, kind, task, content)
     device = _check_device(device)
     try:
@@ -253,6 +259,15 @@ def _resolve_task(path: Path, saved: TaskSignature, wanted: str | Task | None) -
                 f"{here!r}, got {there!r}."
             )
     return task
+
+
+def _outside(task: Task) -> dict[str, Any]:
+    """The reference, inputs and disturbance that an agent depends on, as plain values."""
+    disturbance = task.disturbance
+    return {
+        **task.outside.config,
+        **({} if disturbance is None else {"disturbance": disturbance.config}),
+    }
 
 
 def _with_actuator(path: Path, task: Task, numbers: Any) -> Task:

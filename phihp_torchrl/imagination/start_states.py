@@ -65,7 +65,7 @@ class BoxStates:
 class TaskStates:
     """Start states of a task whose physical components come from another sampler.
 
-    Behind them stand the registers of the task's actuator, if it has one.
+    Behind them stand the task's registers, if it has some; references and inputs are drawn.
 
     Args:
         task: the task.
@@ -94,14 +94,9 @@ class TaskStates:
         device: torch.device | str | None = None,
     ) -> Tensor:
         states = self.physical.sample(shape, generator, device)
-        actuator, bounds = self.task.actuator, self.task.bounds
-        if actuator is None:
-            return states
-        if not self.under_way:
-            return self.task.at_rest(states)
-        size = [*shape, actuator.places(self.task.action_dim), self.task.action_dim]
-        unit = torch.rand(size, generator=generator, device=_draw_device(generator)).mul(2).sub(1)
-        registers = actuator.random(bounds.to(unit.device).from_unit(unit))
+        if not self.under_way or not self.task.register_count:
+            return self.task.at_start(states, generator)
+        registers = self.task.random_registers(shape, generator)
         return torch.cat([states, registers.to(states)], -1)
 
 

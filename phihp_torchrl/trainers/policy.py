@@ -120,10 +120,11 @@ class PolicyTrainer(TD3Trainer):
             self.world_model, self.rollouts, config.refit, config.td3.gamma, compile=compile
         )
         self.replay = FlatReplay(config.replay_capacity, task.state_dim, task.action_dim)
-        self.worlds = self._new_worlds()
+        self._enter(self._new_worlds())
         self.best = [layer.clone() for layer in (*self.update.actor, *self.update.critics)]
         self.best_return = -math.inf
         self._evaluation_states = task.sample_start([config.evaluation_episodes], self.generator)
+        self._evaluation_signals = self._draw_signals(config.evaluation_episodes, seed)
         truth = None if world is None else world.model()
         self._real = None
         if truth is not None:
@@ -133,6 +134,7 @@ class PolicyTrainer(TD3Trainer):
         self._world_states = task.sample_start(
             [config.real_evaluation_episodes], torch.Generator().manual_seed(seed)
         )
+        self._world_signals = self._draw_signals(config.real_evaluation_episodes, seed)
 
     @property
     def max_age(self) -> int:
@@ -167,7 +169,7 @@ class PolicyTrainer(TD3Trainer):
                     scale = learning_rate_scale(left, config.decay)
                     losses = self._learn(config.batch_size, scale)
                 self.updates += 1
-        imagined = self._play(self.rollouts, self._evaluation_states)
+        imagined = self._play(self.rollouts, self._evaluation_states, self._evaluation_signals)
         # Of equal ones the later, which has learned more; none that left the finite numbers.
         if -math.inf < imagined >= self.best_return:
             self.best_return = imagined
@@ -182,7 +184,9 @@ class PolicyTrainer(TD3Trainer):
         if config.refit.is_due(self.updates, config.updates):
             metrics |= self._refit_critics()
         if config.real_evaluation_episodes and self._real is not None:
-            metrics["policy/real_return"] = self._play(self._real, self._world_states)
+            metrics["policy/real_return"] = self._play(
+                self._real, self._world_states, self._world_signals
+            )
         self.seconds += time.perf_counter() - start
         return {**metrics, "policy/seconds": self.seconds}
 
@@ -270,10 +274,25 @@ class PolicyTrainer(TD3Trainer):
         """The unit of a loss: critics' is squared."""
         return self.scales.reward ** (2 if name == "loss_qvalue" else 1)
 
-    def _play(self, world: Rollouts, states: Tensor) -> float:
+    @property
+    def _evaluation_steps(self) -> int:
+        return self.config.evaluation_steps or self.task.max_steps
+
+    def _draw_signals(self, episodes: int, seed: int) -> Tensor | None:
+        """References and inputs of episodes, ``[1 + steps, episodes, size]``, if there are any."""
+        if not self.task.outside:
+            return None
+        generator, steps = torch.Generator().manual_seed(seed), 1 + self._evaluation_steps
+        drawn = self.task.outside.draw([episodes], steps, generator)
+        return self.task.outside.windows(drawn, 0, steps)
+
+    def _play(self, world: Rollouts, states: Tensor, signals: Tensor | None) -> float:
         """Mean return of the noise-free actor; minus infinity where it left the finite numbers."""
-        steps = self.config.evaluation_steps or self.task.max_steps
-        score = world.returns(self.update.networks.actor, states, steps).total
+        later = None
+        if signals is not None:
+            states, later = self.task.with_signals(states, signals[0]), signals[1:]
+        actor, steps = self.update.networks.actor, self._evaluation_steps
+        score = world.returns(actor, states, steps, signals=later).total
         return self.scales.reward * torch.nan_to_num(score, nan=-math.inf).mean().item()
 
     def _keep(self, layers: list[Tensor]) -> None:

@@ -15,7 +15,7 @@ from phihp_torchrl.agents import (
     make_td3_loss,
 )
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.imagination import Rollouts, Worlds, draw_noise
+from phihp_torchrl.imagination import Rollouts, SignalStream, Worlds, draw_noise
 
 
 class TD3Trainer:
@@ -41,6 +41,16 @@ class TD3Trainer:
         self.update = TD3Update(self.loss, world_model, td3, compile=compile)
         self.updates = 0
         self.seconds = 0.0
+        self.stream: SignalStream | None = None
+        """References and inputs of the worlds, for a task that has some."""
+
+    def _enter(self, worlds: Worlds) -> None:
+        """Take these worlds, with references and inputs of their own."""
+        self.worlds = worlds
+        if self.task.outside:
+            self.stream = SignalStream(self.task, len(worlds.age), self.generator)
+            state = self.task.with_signals(worlds.state, self.stream.present())
+            self.worlds = worlds._replace(state=state)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
@@ -51,6 +61,7 @@ class TD3Trainer:
             "updates": self.updates,
             "seconds": self.seconds,
             "generator": self.generator.get_state(),
+            **({} if self.stream is None else {"signals": self.stream.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -61,6 +72,8 @@ class TD3Trainer:
         self.updates = state["updates"]
         self.seconds = state["seconds"]
         self.generator.set_state(state["generator"])
+        if self.stream is not None:
+            self.stream.load_state_dict(state["signals"])
 
     def _act(
         self, world: Rollouts, starts: Tensor, *, noise: float, random_fraction: float
@@ -79,6 +92,7 @@ class TD3Trainer:
             std=noise,
             random_fraction=random_fraction,
             generator=self.generator,
+            signals=None if self.stream is None else self.stream.advance(len(starts)),
         )
         batch, self.worlds = world.chunk(self.update.networks.actor, self.worlds, drawn)
         self.replay.extend(batch)

@@ -39,8 +39,8 @@ def disagreements(task: Task, data: TensorDictBase) -> list[str]:
         >>> disagreements(task, data)[0][:67]
         'the world ended 1 of 4 steps after which the task says it goes on, '
     """
-    state, _ = task.split(task.locate(data["observation"]))
-    next_state, _ = task.split(task.locate(data["next", "observation"]))
+    state = task.locate(data["observation"])
+    next_state = task.locate(data["next", "observation"])
     ours = task.is_terminated(next_state)
     theirs = data["next", "terminated"].reshape(-1)
     found = []
@@ -54,7 +54,7 @@ def disagreements(task: Task, data: TensorDictBase) -> list[str]:
             f"the world went on after {late} of {len(theirs)} steps that the task says are the "
             "last, so imagined lives will be shorter than real ones"
         )
-    expected = task.reward(state, task.clip_action(data["action"]), next_state)
+    expected = task.earned(state, task.clip_action(data["action"]), next_state)
     given = data["next", "reward"].reshape(-1)
     difference = (given - expected).abs().mean().item()
     spread = torch.cat([given, expected]).std(correction=0).item()
