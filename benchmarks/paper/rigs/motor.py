@@ -11,7 +11,7 @@ from torch import Tensor
 from phihp_torchrl import Box, Plant, Signal, System, Task, register_plant, register_task
 from phihp_torchrl.tasks import Disturbance, Trajectories
 
-SPEED = 60.0
+SPEED = 50.0
 """Largest reference in rad/s."""
 
 
@@ -49,8 +49,9 @@ class MotorPlant(Plant):
 
 
 def follow(state: Tensor, action: Tensor, next_state: Tensor, reference: Tensor) -> Tensor:
-    """0 on the reference, and less the farther from it."""
-    return -((next_state[..., 0] - reference[..., 0]) / 20.0).square()
+    """0 on the reference, and less the farther from it, by the first rad/s as well."""
+    error = (next_state[..., 0] - reference[..., 0]).abs()
+    return -((error / 20.0).square() + 0.05 * error)
 
 
 def motor(preview: int, name: str) -> Task:
@@ -58,14 +59,14 @@ def motor(preview: int, name: str) -> Task:
     return Task(
         name=name,
         system=Motor(),
-        action_high=(12.0,),
+        action_high=(24.0,),
         time_step=0.02,
-        max_steps=200,
+        max_steps=250,
         reset=Box.around((0.0, 0.0), (SPEED, 2.0)),
         reward=follow,
-        coverage=Box.around((0.0, 0.0), (1.3 * SPEED, 10.0)),
+        coverage=Box.around((0.0, 0.0), (1.3 * SPEED, 20.0)),
         reference=Signal(
-            ("speed",), (-SPEED,), (SPEED,), preview=preview, sampler=Trajectories(hold=0.7)
+            ("speed",), (-SPEED,), (SPEED,), preview=preview, sampler=Trajectories(hold=1.5)
         ),
         disturbance=Disturbance(high={"speed": 50.0, "current": 30.0}),
     )
