@@ -167,7 +167,7 @@ def measure(policy: Policy, task: Task, episodes: int) -> dict[str, dict[str, fl
     """RMS error on random references, and steady errors on constant ones, in each world."""
     found = {}
     for name, changes in WORLDS.items():
-        options = {"episodes": episodes, "seed": EVALUATION_SEED}
+        options: dict[str, Any] = {"episodes": episodes, "seed": EVALUATION_SEED}
         moving = play(policy, task, changes, **options)
         speeds, references = play(
             policy, task, changes, steps=STEADY_STEPS, constant=True, **options

@@ -86,7 +86,7 @@ class Outside:
         """The registers at steps from ``first`` on, ``[steps, *batch, size]``."""
         return torch.stack([self.window(trajectory, first + k) for k in range(steps)])
 
-    def read(self, given: Mapping[str, Any], like: Tensor) -> Tensor | None:
+    def read(self, given: Mapping[str, Any], like: Tensor) -> Tensor:
         """The registers ``[*batch, size]`` from values that a caller gives under their keys.
 
         Args:
