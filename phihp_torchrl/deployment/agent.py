@@ -112,8 +112,9 @@ class Agent(TensorDictModuleBase):
 
         Where the planner replans every few steps or starts warm, ``"is_init"`` tells it that an
         episode starts (:class:`torchrl.envs.InitTracker`); without it, call :meth:`reset`. The same
-        holds for a task with an actuator, if the observation is the system's alone: the agent then
-        remembers the commands that are under way.
+        holds for a task with registers (an actuator, a limit or a price of the action's rate), if
+        the observation is the system's alone: the agent then remembers its own commands. Where the
+        task limits the rate, the action written is within it.
 
         A task's reference and inputs are read from ``"reference"`` and ``"inputs"``, unless they
         are in the observation: ``[*batch, k]``, or with their preview ``[*batch, rows, k]``. They
@@ -122,10 +123,14 @@ class Agent(TensorDictModuleBase):
         with torch.no_grad():
             if self._memory is not None and self._memory.is_asked(tensordict):
                 seen = self._memory.extend(tensordict)
-                action = self._act(seen)["action"]
-                self._memory.record(action)
+                action = self._memory.record(self._act(seen)["action"])
                 return tensordict.set("action", action)
-            return self._act(tensordict)
+            acted = self._act(tensordict)
+            if self.task.action_rate_limit is None:
+                return acted
+            task = self.task
+            _, registers = task.split(task.locate(acted["observation"]))
+            return acted.set("action", task.command(registers, acted["action"]))
 
     def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.planner is not None:

@@ -104,7 +104,7 @@ def save_agent(
         "package_version": package_version(),
         "kind": agent.kind,
         "task": asdict(TaskSignature.of(agent.task)),
-        **({"actuator": actuator.config} if (actuator := agent.task.actuator) else {}),
+        **_additions(agent.task),
         **({"outside": outside} if (outside := _outside(agent.task)) else {}),
         **config,
         "weights_sha256": hashlib.sha256(data).hexdigest(),
@@ -178,7 +178,7 @@ def load_agent(
     except (ValueError, TypeError, AttributeError) as error:
         raise AgentError(f"{path}: {error}") from error
     task = _resolve_task(path, signature, task)
-    task = _with_actuator(path, task, content.get("actuator"))
+    task = _with_additions(path, task, content)
     if (saved := content.get("outside", {})) != (ours := _outside(task)):
         raise AgentError(
             f"{path}: task {task.name!r} is another one here: expected the reference, inputs and "
@@ -270,18 +270,32 @@ def _outside(task: Task) -> dict[str, Any]:
     }
 
 
-def _with_actuator(path: Path, task: Task, numbers: Any) -> Task:
-    """The task with the actuator that the agent was trained for."""
+_RATES = ("action_rate_limit", "action_rate_cost")
+
+
+def _additions(task: Task) -> dict[str, Any]:
+    """What a task adds to the state of its system, as plain values; nothing where it adds none."""
+    rates = {name: value for name in _RATES if (value := getattr(task, name)) is not None}
+    return ({} if task.actuator is None else {"actuator": task.actuator.config}) | rates
+
+
+def _with_additions(path: Path, task: Task, content: Mapping[str, Any]) -> Task:
+    """The task with the actuator and the rates for which the agent was trained."""
+    numbers = content.get("actuator")
     try:
-        saved = None if numbers is None else from_mapping(Actuator, numbers, "actuator")
+        actuator = None if numbers is None else from_mapping(Actuator, numbers, "actuator")
+        rates = {name: content.get(name) for name in _RATES}
+        changed = replace(task, actuator=actuator, **rates)  # type: ignore[arg-type]
     except (ConfigError, TypeError, AttributeError) as error:
         raise AgentError(f"{path}: {error}") from error
-    if task.actuator not in (None, saved):
-        raise AgentError(
-            f"{path}: task {task.name!r} is another one here: expected its actuator "
-            f"{task.actuator}, got {saved}."
-        )
-    return task if task.actuator == saved else replace(task, actuator=saved)
+    for name in ("actuator", *_RATES):
+        here, saved = getattr(task, name), getattr(changed, name)
+        if here not in (None, saved):
+            raise AgentError(
+                f"{path}: task {task.name!r} is another one here: expected its {name} {here}, "
+                f"got {saved}."
+            )
+    return changed
 
 
 def _read_weights(

@@ -98,7 +98,7 @@ def run_realtime(
             raise ConfigError(name, f"expected a positive number, got {value}.")
     period, ticks = 1.0 / rate, max(1, round(rate * seconds))
     task = find_task(task)
-    timed = replace(task, time_step=period)
+    timed = replace(task.unpriced(), time_step=period)
     world = TaskWorldModel(timed, SimulatedWorld(timed).oracle())
     state = task.sample_start([], torch.Generator().manual_seed(seed))
     action = task.bounds.center

@@ -35,7 +35,8 @@ class UnderWay:
         >>> memory = UnderWay(replace(get_task("pendulum"), actuator=Actuator(delay_steps=1.0)))
         >>> shown = TensorDict(observation=torch.tensor([1.0, 0.0, 0.0]))
         >>> _ = memory.extend(shown)
-        >>> memory.record(torch.tensor([2.0]))
+        >>> memory.record(torch.tensor([2.5]))
+        tensor([2.])
         >>> memory.extend(shown)["observation"]
         tensor([1., 0., 0., 1.])
     """
@@ -106,14 +107,20 @@ class UnderWay:
         self._state = torch.cat([physical, registers], -1)
         return tensordict.copy().set("observation", task.complete(seen, registers))
 
-    def record(self, action: Tensor) -> None:
-        """Remember a command ``[*batch, m]`` that :meth:`extend` was asked before."""
+    def record(self, action: Tensor) -> Tensor:
+        """Remember the action ``[*batch, m]`` of a step for which :meth:`extend` was asked.
+
+        Returns:
+            The command, which is the action within its bounds and its rate.
+        """
         assert self._state is not None
-        if self._model is not None:
-            self._state = self._model.transition(self._state, action).next_state
-            return
         physical, registers = self.task.split(self._state)
-        self._state = torch.cat([physical, self.task.acting(registers, action)[1]], -1)
+        command = self.task.command(registers, action)
+        if self._model is not None:
+            self._state = self._model.transition(self._state, command).next_state
+        else:
+            self._state = torch.cat([physical, self.task.acting(registers, command)[1]], -1)
+        return command
 
     def _read(self, tensordict: TensorDictBase, registers: Tensor, starts: Tensor) -> Tensor:
         outside = self.task.outside

@@ -65,7 +65,8 @@ class BoxStates:
 class TaskStates:
     """Start states of a task whose physical components come from another sampler.
 
-    Behind them stand the task's registers, if it has some; references and inputs are drawn.
+    Behind them stand the registers that the task adds, such as commands under way; references and
+    inputs among them are drawn.
 
     Args:
         task: the task.

@@ -24,7 +24,7 @@ def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
     """Return the transitions of recordings, with the time step of each.
 
     A transition is left out, and counted in the log, where a state is unknown before or after it,
-    and where its command is beyond the bounds of the task, which a model would clip.
+    and where its command is beyond the bounds or the rate of the task, which a model would clip.
 
     Args:
         task: the task, which says what was earned and where an episode ends.
@@ -67,10 +67,12 @@ def observations(task: Task, recording: Recording) -> Tensor:
     This is the only place where a sample of a log becomes an observation: what a task adds to the
     physical state, from the commands so far, belongs here.
     """
-    if task.actuator is None:
+    if not task.register_count:
         return task.observe(recording.state)
     held = torch.cat([recording.intervals, recording.intervals[-1:]])
-    _, registers = task.actuator.along(task.clip_action(recording.action), held)
+    commands = task.clip_action(recording.action)
+    rest = task.clip_action(torch.zeros_like(commands[0]))
+    _, registers = task.registers.along(commands, held, rest)
     return task.observe(torch.cat([recording.state, registers], -1))
 
 
@@ -109,14 +111,19 @@ def _of(task: Task, log: Recording, goes_on: bool, left: Counter[str]) -> Tensor
     known = observation.isfinite().all(-1)
     unknown = ~(known[:-1] & known[1:])
     left["a state is unknown before or after them"] += int(unknown.sum())
-    if goes_on and task.actuator is not None:
-        early = log.time[:-1] < log.time[0] + task.actuator.memory(task.time_step)
+    if goes_on and task.register_count:
+        early = log.time[:-1] < log.time[0] + task.registers.memory(task.time_step)
         left["what was under way before their stretch is unknown"] += int((early & ~unknown).sum())
         unknown |= early
     left[
         f"their commands are beyond the bounds of task {task.name!r}, {task.action_low} to "
         f"{task.action_high}; widen those in Task(action_low=..., action_high=...)"
     ] += int((outside & ~unknown).sum())
+    outside |= (fast := _too_fast(task, observation[:-1], action, log.intervals) & ~outside)
+    left[
+        f"their commands change faster than the action_rate_limit of task {task.name!r}, "
+        f"{task.action_rate_limit}"
+    ] += int((fast & ~unknown).sum())
     left -= Counter()  # drops the zeros
     use = ~(unknown | outside)
     at = use.nonzero()[:, 0]
@@ -137,3 +144,14 @@ def _of(task: Task, log: Recording, goes_on: bool, left: Counter[str]) -> Tensor
         ),
         batch_size=[len(at)],
     )
+
+
+def _too_fast(task: Task, observation: Tensor, action: Tensor, intervals: Tensor) -> Tensor:
+    """Whether a command of a log is beyond the rate that the task allows, bool ``[T]``."""
+    if task.action_rate_limit is None:
+        return torch.zeros(len(action), dtype=torch.bool)
+    registers = task.split(task.locate(observation))[1]
+    clipped = task.clip_action(action)
+    commands = task.registers.command(registers, clipped, intervals)
+    slack = _SLACK * task.bounds.scale.to(action)
+    return ((clipped - commands).abs() > slack).any(-1)

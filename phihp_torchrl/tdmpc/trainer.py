@@ -229,7 +229,7 @@ class TDMPCTrainer:
         left = config.real_steps - self.real_steps
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             rollout = self.env.rollout(min(self.task.max_steps, left), policy).detach()
-        self.replay.extend(_as_floats(rollout))
+        self.replay.extend(_as_floats(self.task, rollout))
         self.real_steps += len(rollout)
         learned_from = len(rollout)
         if at_random:
@@ -287,15 +287,19 @@ class TDMPCTrainer:
         }
 
 
-def _as_floats(rollout: TensorDictBase) -> TensorDict:
-    """Return the entries of an episode that replay keeps, in float32."""
+def _as_floats(task: Task, rollout: TensorDictBase) -> TensorDict:
+    """Return the entries of an episode that replay keeps, in float32; rewards less their prices."""
     following = rollout["next"]
+    reward = following["reward"].float()
+    price = task.price(task.locate(rollout["observation"].float()), rollout["action"].float())
+    if price is not None:
+        reward = reward - price.unsqueeze(-1)
     return TensorDict(
         observation=rollout["observation"].float(),
         action=rollout["action"].float(),
         next=TensorDict(
             observation=following["observation"].float(),
-            reward=following["reward"].float(),
+            reward=reward,
             terminated=following["terminated"],
             batch_size=rollout.batch_size,
         ),

@@ -133,6 +133,20 @@ def steady(task: Task, policy: Policy) -> Policy:
     return guarded
 
 
+def within_rate(task: Task, policy: Policy) -> Policy:
+    """Make a policy whose actions are the commands that the world gets: in bounds and rate."""
+    if task.action_rate_limit is None:
+        return policy
+
+    def limited(tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = policy(tensordict)
+        action = tensordict["action"]
+        _, registers = task.split(task.locate(tensordict["observation"].to(action.dtype)))
+        return tensordict.set("action", task.command(registers, action))
+
+    return limited
+
+
 def drop_unusable(data: TensorDict) -> tuple[TensorDict, int]:
     """Leave out real transitions of which a number is missing or infinite, and warn.
 
@@ -200,8 +214,10 @@ def planning_policy(
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict["step_count"].item() == 0:
             planner.reset()
-        observed = TensorDict(observation=tensordict["observation"].float())
-        action = planner(observed)["action"]
+        observation = tensordict["observation"].float()
+        if task.register_count:  # whose units are half-ranges, and the aim may have others
+            observation = aim.observe(task.locate(observation))
+        action = planner(TensorDict(observation=observation))["action"]
         if signal is None:
             action = action + scale * torch.randn(scale.shape, generator=generator)
         else:

@@ -38,6 +38,7 @@ from phihp_torchrl.trainers.collect import (
     planning_policy,
     random_policy,
     steady,
+    within_rate,
 )
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.exploration import Exploration
@@ -141,7 +142,7 @@ class ModelTrainer:
         return self.transitions().state
 
     def transitions(self) -> Batch:
-        """Return all real transitions, ``[N]``, in the form of replay buffers."""
+        """Return all real transitions, ``[N]``, as replay keeps them: with rewards less prices."""
         if self.data is None:
             state = torch.zeros(0, self.task.state_dim)
             action = torch.zeros(0, self.task.action_dim)
@@ -151,7 +152,9 @@ class ModelTrainer:
         action = self.data["action"]
         # "done" in the data includes truncations, which are not terminations.
         terminated = self.task.is_terminated(next_state)
-        return Batch(state, action, self.data["next", "reward"][:, 0], next_state, terminated)
+        reward, price = self.data["next", "reward"][:, 0], self.task.price(state, action)
+        reward = reward if price is None else reward - price
+        return Batch(state, action, reward, next_state, terminated)
 
     def constants_covariance(self) -> Tensor:
         """Covariance of the prior's learned constants after the last fit, ``[learned, learned]``.
@@ -213,7 +216,7 @@ class ModelTrainer:
         self.env.set_seed(self._draw_seed())
         self.crossings.clear()
         with torch.no_grad():
-            policy = steady(self.task, policy)
+            policy = within_rate(self.task, steady(self.task, policy))
             rollout = self.env.rollout(steps, policy, break_when_any_done=False)
         self._tell_crossings(steps)
         done = rollout["next", "done"].clone()

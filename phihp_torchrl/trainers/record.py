@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.trainers.collect import CollectConfig, random_policy, steady
+from phihp_torchrl.trainers.collect import CollectConfig, random_policy, steady, within_rate
 from phihp_torchrl.trainers.exploration import Exploration
 from phihp_torchrl.worlds import World, crossings_text, guard_env
 
@@ -52,6 +52,7 @@ def record(world: World, config: CollectConfig, steps: int, seed: int, path: Pat
     generator = torch.Generator().manual_seed(seed)
     exploration = Exploration(task, config.exploration)
     policy = steady(task, random_policy(task, config, generator, exploration))
+    policy = within_rate(task, policy)
     crossings: Counter[str] = Counter()
     env = guard_env(world.make_env(), task, config.exploration.guards, crossings)
     env.set_seed(seed)

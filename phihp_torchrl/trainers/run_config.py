@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from phihp_torchrl.config import (
@@ -60,6 +60,10 @@ class RunConfig:
         progress: whether to show progress bars on a terminal.
         actuator: numbers of the task's actuator that differ, by name: delay_steps, lag, slew,
             dead_zone, gain_low.
+        action_rate_limit: largest rate of each action in its units per second, one number or one
+            for each; null for the task's own.
+        action_rate_cost: price of a change of the action, squared and in half-ranges, where the
+            task is imagined; null for the task's own, 0 for none.
         world: the real world.
         planner: how the agent plans.
         logger: where metrics are logged, besides metrics.csv.
@@ -89,6 +93,8 @@ class RunConfig:
     compile: bool = True
     progress: bool = True
     actuator: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    action_rate_limit: float | tuple[float, ...] | None = None
+    action_rate_cost: float | None = None
     world: Any = field(default_factory=SimulatedConfig, metadata={"kinds": WORLDS})
     planner: SearchConfig | None = field(default_factory=CEMConfig, metadata={"kinds": PLANNERS})
     logger: LoggerConfig = field(default_factory=LoggerConfig)
@@ -270,14 +276,14 @@ def read_run_config(settings: Mapping[str, Any], given: Sequence[str] = ()) -> R
 
 
 def task_of(config: RunConfig, task: Task | None = None) -> Task:
-    """Return the task of a run, with the actuator that its settings give it.
+    """Return the task of a run, with the actuator and the rates that its settings give it.
 
     Args:
         config: settings of the run.
         task: the task, if it is not the registered one of that name.
 
     Raises:
-        ConfigError: for a task that is not registered, and for an actuator that does not fit it.
+        ConfigError: for a task that is not registered, and for numbers that do not fit it.
 
     Examples:
         >>> from phihp_torchrl import load_config
@@ -291,7 +297,10 @@ def task_of(config: RunConfig, task: Task | None = None) -> Task:
         raise ConfigError(
             error.key, f"{error.reason} A plugin may register more: plugins=[my_task.py]."
         ) from error
-    return task.with_actuator(config.actuator)
+    names = ("action_rate_limit", "action_rate_cost")
+    rates = {name: value for name in names if (value := getattr(config, name)) is not None}
+    task = task.with_actuator(config.actuator)
+    return replace(task, **rates) if rates else task
 
 
 def check_run(config: RunConfig, world: World) -> None:

@@ -18,6 +18,7 @@ from phihp_torchrl.agents import (
     learning_rate_scale,
 )
 from phihp_torchrl.config import ConfigError, check_count, check_not_negative, check_share
+from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Batch, Rollouts, Worlds
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.context import Context
@@ -150,9 +151,14 @@ class RealTD3Trainer(TD3Trainer):
             raise ConfigError(
                 "world.kind", f"expected a simulated world for this phase, got {real}."
             )
-        super().__init__(model, config, seed=seed, compile=compile)
+        # Critics learn rewards less the prices of the task; evaluations report the world's.
+        priced = TaskWorldModel(task, model.transitions)
+        super().__init__(priced, config, seed=seed, compile=compile)
         self.config = config
-        self.world = Rollouts(model, act, task.max_steps, compile=compile)
+        self.world = Rollouts(priced, act, task.max_steps, compile=compile)
+        self._played = self.world
+        if model.task != task:
+            self._played = Rollouts(model, act, task.max_steps, compile=compile)
         given = 0 if transitions is None else len(transitions.reward)
         capacity = min(config.replay_capacity, given + config.real_steps)
         self.replay = FlatReplay(capacity, task.state_dim, task.action_dim)
@@ -214,7 +220,7 @@ class RealTD3Trainer(TD3Trainer):
     def evaluate(self) -> Tensor:
         """Returns ``[evaluation_episodes]`` of the noise-free actor in the real world."""
         states, steps = self._evaluation_states, self.task.max_steps
-        return self.world.returns(self.update.networks.actor, states, steps).total
+        return self._played.returns(self.update.networks.actor, states, steps).total
 
     def parts(self) -> dict[str, Any]:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""

@@ -54,7 +54,8 @@ def disagreements(task: Task, data: TensorDictBase) -> list[str]:
             f"the world went on after {late} of {len(theirs)} steps that the task says are the "
             "last, so imagined lives will be shorter than real ones"
         )
-    expected = task.earned(state, task.clip_action(data["action"]), next_state)
+    command = task.command(task.split(state)[1], data["action"])
+    expected = task.earned(state, command, next_state)
     given = data["next", "reward"].reshape(-1)
     difference = (given - expected).abs().mean().item()
     spread = torch.cat([given, expected]).std(correction=0).item()

@@ -1,10 +1,11 @@
-"""The observations of a world, with the commands that are under way in its task's actuator."""
+"""The observations of a world, with what its task adds to the state, and the rate of commands."""
 
 from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right
+from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import Transform
 
@@ -17,13 +18,14 @@ def command_memory(task: Task) -> list[Transform]:
 
 
 class CommandMemory(Transform):
-    """Append the registers of a task's actuator to the observations of an environment.
+    """Append the registers of a task to the observations of an environment, and limit the rate.
 
-    A world shows the system alone. What is under way between a command and its effect follows from
-    the commands of the episode, and the observation of the task has it behind the system's.
+    A world shows the system alone. What is under way between a command and its effect, and the last
+    action, follow from the commands of the episode, and the observation of the task has them behind
+    the system's. The environment gets each command within the rate that the task allows.
 
     Args:
-        task: the task, with an actuator.
+        task: the task, with registers.
 
     Examples:
         >>> from dataclasses import replace
@@ -55,8 +57,18 @@ class CommandMemory(Transform):
             fresh = torch.where(expand_as_right(mask, fresh), fresh, tensordict["observation"])
         return tensordict_reset.set("observation", fresh)
 
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.task.action_rate_limit is None or "action" not in tensordict:
+            return tensordict
+        registers, action = self._registers(tensordict), tensordict["action"]
+        command = self.task.command(registers, action.to(registers.dtype))
+        return tensordict.set("action", command.to(action.dtype))
+
+    def _registers(self, tensordict: TensorDictBase) -> Tensor:
+        return self.task.split(self.task.locate(tensordict["observation"]))[1]
+
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        _, before = self.task.split(self.task.locate(tensordict["observation"]))
+        before = self._registers(tensordict)
         _, after = self.task.acting(before, tensordict["action"].to(before.dtype))
         shown = next_tensordict["observation"]
         return next_tensordict.set("observation", self.task.complete(shown, after))

@@ -159,7 +159,7 @@ def test_there_is_no_steady_error_with_an_estimate(mass):
 def test_the_agent_on_disk_refuses_a_task_with_another_reference(tmp_path):
     task = disturbed()
     save_agent(Agent(task, actor=Actor(task)), tmp_path)
-    assert load_agent(tmp_path, task=task).task is task
+    assert load_agent(tmp_path, task=task).task == task
     wider = replace(AIM, high=(2.0,))
     with pytest.raises(AgentError, match="expected the reference, inputs and disturbance"):
         load_agent(tmp_path, task=disturbed(reference=wider))

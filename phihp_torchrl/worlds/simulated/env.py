@@ -23,10 +23,11 @@ class TaskEnv(gym.Env[Any, Any]):
 
     Observations are those of the system, in float32, without what is under way in an actuator.
     Behind them are the task's references and inputs with their previews, as :meth:`Task.observe`
-    has them; ``info`` has their present values by name. Actions are in physical units and clipped
-    to their bounds, the arithmetic is in float64. Episodes end where the task terminates them;
-    ``gymnasium.make`` applies ``task.max_steps`` by a ``TimeLimit``. Subclasses for the paper's
-    systems inherit rendering from gymnasium's environments.
+    has them; ``info`` has their present values by name. Actions are in physical units and brought
+    within their bounds and rate, the arithmetic is in float64. Rewards are those of the task,
+    without prices. Episodes end where the task terminates them; ``gymnasium.make`` applies
+    ``task.max_steps`` by a ``TimeLimit``. Subclasses for the paper's systems inherit rendering from
+    gymnasium's environments.
 
     Args:
         task: a :class:`~phihp_torchrl.tasks.Task` or the name of a registered one.
@@ -60,7 +61,7 @@ class TaskEnv(gym.Env[Any, Any]):
         render_mode: str | None = None,
     ) -> None:
         super().__init__()  # in a subclass: what gymnasium's environment needs for drawing
-        self.task = find_task(task)
+        self.task = find_task(task).unpriced()
         if actuator is not None:
             self.task = replace(self.task, actuator=actuator)
         self.plant = plant or find_plant(self.task.system)

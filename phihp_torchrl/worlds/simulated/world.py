@@ -102,11 +102,12 @@ class SimulatedWorld(World):
     def model(self) -> TaskWorldModel | None:
         """Return the world as an exact model, of any batch shape.
 
-        There is none where the world treats commands otherwise than the task says, or where its
+        Its rewards are the world's, without the prices of the task. There is none where the world
+        treats commands otherwise than the task says, or where its
         sensors are noisy.
         """
         exact = self.actuator == self.task.actuator and not any(self.config.noise.values())
-        return TaskWorldModel(self.task, self.oracle()) if exact else None
+        return TaskWorldModel(self.task.unpriced(), self.oracle()) if exact else None
 
     def step(self, state: Tensor, action: Tensor) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
@@ -147,7 +148,8 @@ class SimulatedWorld(World):
         Returns:
             The environment, in float32.
         """
-        model = TaskWorldModel(replace(self.task, actuator=self.actuator), self.oracle())
+        task = replace(self.task.unpriced(), actuator=self.actuator)
+        model = TaskWorldModel(task, self.oracle())
         env = WorldModelEnv(model, batch_size=batch_size, device=device, seed=seed)
         return TransformedEnv(env, Compose(StepCounter(max_steps=self.task.max_steps), RewardSum()))
 
