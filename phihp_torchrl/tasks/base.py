@@ -22,14 +22,20 @@ from phihp_torchrl.tasks.actuator import Actuator
 from phihp_torchrl.tasks.actuator_part import ActuatorPart
 from phihp_torchrl.tasks.bounds import ActionBounds, read_limits
 from phihp_torchrl.tasks.box import Box
+from phihp_torchrl.tasks.disturbance import Disturbance, DisturbancePart
 from phihp_torchrl.tasks.last_action import LastAction
 from phihp_torchrl.tasks.numbers import Numbers, check_each, read_numbers
+from phihp_torchrl.tasks.outside import Outside, named
 from phihp_torchrl.tasks.registers import Part, Registers
+from phihp_torchrl.tasks.signal import Signal
+from phihp_torchrl.tasks.signal_parts import SignalPart
 
-RewardFn = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""``state [*batch, n], action [*batch, m], next_state [*batch, n] -> reward [*batch]``."""
-TerminatedFn = Callable[[Tensor], Tensor]
-"""``next_state [*batch, n] -> bool [*batch]``."""
+RewardFn = Callable[..., Tensor]
+"""``state [*batch, n], action [*batch, m], next_state [*batch, n] -> reward [*batch]``.
+
+With a parameter ``reference`` or ``inputs`` it gets that signal too, ``[*batch, k]``."""
+TerminatedFn = Callable[..., Tensor]
+"""``next_state [*batch, n] -> bool [*batch]``; it may have those parameters as well."""
 Step = Callable[[Tensor, Tensor], Tensor]
 """``state, action [*batch, m] -> next_state``, of the system's components, for what acts on it."""
 
@@ -94,6 +100,12 @@ class Task:
             ``c * sum(((a_t - a_{t-1}) / half_range) ** 2)``. It is taken from the reward where the
             task is imagined, and never in a world (:meth:`unpriced`). The last action then belongs
             to the state, with a price of 0 too; ``None`` for neither.
+        reference: what is to be followed, such as a set point or a trajectory. Its present value,
+            and its preview, belong to the state. A reward with a fourth parameter of the name
+            ``reference`` gets its value at the end of the step, as far as it was known before.
+        inputs: what acts on the system without being commanded, and is measured, such as wind. Its
+            components are the system's :attr:`~phihp_torchrl.System.input_names`.
+        disturbance: an unmeasured drift that lasts, which an agent estimates while it acts.
 
     Raises:
         ConfigError: for a field whose length or range does not fit the system; the message names
@@ -128,11 +140,19 @@ class Task:
     actuator: Actuator | None = None
     action_rate_limit: Numbers | None = None
     action_rate_cost: float | None = None
+    reference: Signal | None = None
+    inputs: Signal | None = None
+    disturbance: Disturbance | None = None
 
     layout: StateLayout = field(init=False, repr=False, compare=False)
     """Positions, velocities and their limits, for integrators."""
     registers: Registers = field(init=False, repr=False, compare=False)
     """What the task adds to the physical state."""
+    outside: Outside = field(init=False, repr=False, compare=False)
+    """The reference and the inputs, which are the first of the registers."""
+    _reads: dict[str, tuple[str, ...]] = field(
+        init=False, repr=False, compare=False, default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         self._set_bounds()
@@ -158,7 +178,30 @@ class Task:
         object.__setattr__(self, "position_limits", dict(self.position_limits))
         layout = self.system.layout(self.velocity_limits, self.position_limits, self.restitution)
         object.__setattr__(self, "layout", layout)
-        object.__setattr__(self, "registers", Registers(self.parts()))
+        self._check_outside()
+        parts = self.parts()
+        object.__setattr__(self, "registers", Registers(parts))
+        signals = [part for part in parts if isinstance(part, SignalPart)]
+        object.__setattr__(self, "outside", Outside(signals))
+        keys = self.outside.signals
+        self._reads.update({f: named(getattr(self, f), keys) for f in ("reward", "terminated")})
+
+    def _check_outside(self) -> None:
+        given, needed = self.inputs.names if self.inputs else (), self.system.input_names
+        if given != needed:
+            raise ConfigError("inputs", f"expected the system's inputs {needed}, got {given}.")
+        if self.disturbance is not None:
+            self.disturbance.check(self.system)
+        functions = (self.reward, self.exploration_reward, self.terminated)
+        read = any(named(function, ["reference"]) for function in functions)
+        if read and self.reference is None:
+            raise ConfigError("reference", "expected one, for the reward reads it; got none.")
+        if self.reference is not None and not read:
+            raise ConfigError(
+                "reward",
+                "expected a parameter named 'reference' (state, action, next_state, reference), "
+                "else nothing depends on the task's reference.",
+            )
 
     def _set_bounds(self) -> None:
         low, high = read_limits(self.system.action_names, self.action_low, self.action_high)
@@ -168,6 +211,13 @@ class Task:
     def parts(self) -> list[Part]:
         """Make the parts that the task adds to the physical state; the first acts on the system."""
         bounds, parts = self.bounds, list[Part]()
+        # Signals come first: a world shows them behind its observation, and no other registers.
+        if self.inputs is not None:
+            parts.append(SignalPart("inputs", self.inputs, self.time_step, acts=True))
+        if self.reference is not None:
+            parts.append(SignalPart("reference", self.reference, self.time_step, acts=False))
+        if self.disturbance is not None:
+            parts.append(DisturbancePart(self.disturbance, self.system))
         if self.actuator is not None:
             parts.append(ActuatorPart(self.actuator, bounds))
         limit, cost = self.action_rate_limit, self.action_rate_cost
@@ -196,6 +246,11 @@ class Task:
     def observation_dim(self) -> int:
         """Number of observation components, ``o``: those of the system, and the registers."""
         return self.system.observation_dim + self.register_count
+
+    @property
+    def shown_dim(self) -> int:
+        """Number of components that a world shows: the system's observation, and the signals."""
+        return self.system.observation_dim + self.outside.size
 
     @property
     def bounds(self) -> ActionBounds:
@@ -245,13 +300,37 @@ class Task:
     def sample_start(
         self, shape: torch.Size | list[int], generator: torch.Generator | None = None
     ) -> Tensor:
-        """Draw states ``[*shape, n]`` in which episodes start, with nothing under way."""
-        return self.at_rest(self.reset.sample(shape, generator=generator))
+        """Draw states ``[*shape, n]`` in which episodes start, with nothing under way.
+
+        References and inputs are drawn too.
+        """
+        return self.at_start(self.reset.sample(shape, generator=generator), generator)
+
+    def at_start(self, physical: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """The state ``[*batch, n]`` of physical components in which an episode starts."""
+        if not self.register_count:
+            return physical
+        still = physical.new_zeros([*physical.shape[:-1], self.action_dim])
+        registers = self.registers.start(self.clip_action(still), generator)
+        return torch.cat([physical, registers], -1)
 
     def complete(self, observation: Tensor, registers: Tensor) -> Tensor:
-        """The task's observation ``[*batch, o]`` from one of the system's and the registers."""
+        """The task's observation ``[*batch, o]`` from one of the system's and the registers.
+
+        Args:
+            observation: the system's observation, perhaps with the first registers behind it.
+            registers: all registers, ``[*batch, r]``; those that are in the observation are not
+                used.
+        """
         center, scale = self.registers.scales(observation)
-        return torch.cat([observation, (registers.to(observation.dtype) - center) / scale], -1)
+        known = observation.shape[-1] - self.system.observation_dim
+        scaled = (registers.to(observation.dtype) - center) / scale
+        return torch.cat([observation, scaled[..., known:]], -1)
+
+    def with_signals(self, state: Tensor, signals: Tensor) -> Tensor:
+        """The state ``[*batch, n]`` with other signals, registers ``[*batch, outside.size]``."""
+        physical, registers = self.split(state)
+        return torch.cat([physical, self.outside.replaced(registers, signals)], -1)
 
     def rest(self, like: Tensor) -> Tensor:
         """The registers ``[*batch, r]`` with nothing under way, for a tensor ``[*batch, ...]``."""
@@ -316,11 +395,31 @@ class Task:
         else:
             acting, after = self.registers.step(registers, action, self.time_step)
             moved = step(before, acting)
+            if (drift := self.registers.drift(registers)) is not None:
+                moved = moved + self.time_step * drift
             next_state = torch.cat([moved, after], -1)
-        reward = self.reward(before, action, moved)
+        reward = self.earned(state, action, next_state)
         if (price := self.registers.price(registers, action)) is not None:
             reward = reward - price
-        return Transition(next_state, reward, self.is_terminated(moved))
+        return Transition(next_state, reward, self.is_terminated(next_state))
+
+    def earned(self, state: Tensor, command: Tensor, next_state: Tensor) -> Tensor:
+        """The reward of a step without prices, ``[*batch]``.
+
+        Args:
+            state: the state before the step, ``[*batch, n]``.
+            command: the command of the step, ``[*batch, m]``.
+            next_state: the state after it, ``[*batch, n]``.
+        """
+        (before, _), (moved, after) = self.split(state), self.split(next_state)
+        return self.reward(before, command, moved, **self._signals_of("reward", after))
+
+    def _signals_of(self, function: str, registers: Tensor) -> dict[str, Tensor]:
+        """The signals that a function of the task reads, by the names of its parameters."""
+        if not (keys := self._reads[function]):
+            return {}
+        values = self.outside.values(registers)
+        return {key: values[key] for key in keys}
 
     def price(self, state: Tensor, action: Tensor) -> Tensor | None:
         """What a step costs where the task is imagined, ``[*batch]``; ``None`` for nothing.
@@ -347,4 +446,5 @@ class Task:
         """Whether ``next_state`` ``[*batch, n]`` ends the episode, bool ``[*batch]``."""
         if self.terminated is None:
             return torch.zeros(next_state.shape[:-1], dtype=torch.bool, device=next_state.device)
-        return self.terminated(self.split(next_state)[0])
+        moved, registers = self.split(next_state)
+        return self.terminated(moved, **self._signals_of("terminated", registers))

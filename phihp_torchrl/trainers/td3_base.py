@@ -47,6 +47,7 @@ class TD3Trainer(ReplayTrainer):
             std=noise,
             random_fraction=random_fraction,
             generator=self.generator,
+            signals=None if self.stream is None else self.stream.advance(len(starts)),
         )
         batch, self.worlds = world.chunk(self.update.networks.actor, self.worlds, drawn)
         self.replay.extend(batch)
