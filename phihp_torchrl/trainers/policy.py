@@ -126,7 +126,6 @@ class PolicyTrainer:
             generator=self.learner.generator,
             compile=compile,
         )
-        self._world_signals = self._draw_signals(config.real_evaluation_episodes, seed)
 
     @property
     def max_age(self) -> int:
