@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.agents.analytic_config import AnalyticConfig
+from phihp_torchrl.agents.analytic_update import AnalyticUpdate, Draws
 from phihp_torchrl.agents.equations import Layers, act, q_values, soft_update_
 from phihp_torchrl.agents.networks import (
     Actor,
@@ -21,6 +23,8 @@ from phihp_torchrl.agents.update import ActorCriticUpdate, learning_rate_scale
 
 __all__ = [
     "Actor",
+    "AnalyticConfig",
+    "AnalyticUpdate",
     "QNetwork",
     "RefitConfig",
     "TD3Config",

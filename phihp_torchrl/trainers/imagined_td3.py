@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from phihp_torchrl.agents import FlatReplay, learning_rate_scale
-from phihp_torchrl.imagination import Worlds
+from phihp_torchrl.agents import learning_rate_scale
 from phihp_torchrl.trainers.learners import Imagination, register_learner
 from phihp_torchrl.trainers.td3_base import TD3Trainer
 
@@ -24,9 +22,8 @@ class ImaginedTD3(TD3Trainer):
         super().__init__(
             imagination.world_model, config.td3, seed=imagination.seed, compile=imagination.compile
         )
-        self.replay = FlatReplay(config.replay_capacity, self.task.state_dim, self.task.action_dim)
-        age = torch.randint(self.rollouts.max_age, (config.num_worlds,), generator=self.generator)
-        self.worlds = Worlds(self.start_states.sample([config.num_worlds], self.generator), age)
+        self.replay = imagination.new_replay()
+        self.worlds = imagination.new_worlds(self.generator)
 
     @property
     def imagined_steps(self) -> int:

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from phihp_torchrl.agents import ActorCriticUpdate
+from phihp_torchrl.agents import ActorCriticUpdate, FlatReplay
 from phihp_torchrl.config import Registry
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.imagination import Rollouts, StartStates
+from phihp_torchrl.imagination import Rollouts, StartStates, Worlds
 
 
 class Learner(Protocol):
@@ -31,12 +31,14 @@ class Learner(Protocol):
         (0, 0)
     """
 
-    update: ActorCriticUpdate
-    """Actor and critics, which the learner changes in place."""
     updates: int
     """Critic updates so far."""
     generator: torch.Generator
     """Source of all random numbers but the initial weights."""
+
+    @property
+    def update(self) -> ActorCriticUpdate:
+        """Actor and critics, which the learner changes in place."""
 
     @property
     def imagined_steps(self) -> int:
@@ -77,6 +79,17 @@ class Imagination:
     config: Any
     seed: int
     compile: bool
+
+    def new_replay(self) -> FlatReplay:
+        """An empty replay of the size that the settings say."""
+        task = self.world_model.task
+        return FlatReplay(self.config.replay_capacity, task.state_dim, task.action_dim)
+
+    def new_worlds(self, generator: torch.Generator) -> Worlds:
+        """Worlds at ages of all sizes, so that they do not start anew all at once."""
+        count = self.config.num_worlds
+        age = torch.randint(self.rollouts.max_age, (count,), generator=generator)
+        return Worlds(self.start_states.sample([count], generator), age)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from phihp_torchrl.trainers.policy_scales import check_scales, training_scales
 from phihp_torchrl.worlds import World
 
 # Losses are in these powers of the reward's unit, other metrics have none.
-_POWERS = {"loss_actor": 1, "loss_qvalue": 2}
+_POWERS = {"loss_actor": 1, "loss_qvalue": 2, "return_range": 1}
 
 
 class PolicyTrainer:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from phihp_torchrl.agents import (
+    AnalyticConfig,
     RefitConfig,
     TD3Config,
 )
@@ -25,7 +26,8 @@ class PolicyConfig:
     """Settings of phase 2, which trains actor and critics in imagination (paper, section 4.2).
 
     Args:
-        method: the way to learn, td3 or another registered one.
+        method: the way to learn, td3, analytic (gradients through the model, where that is smooth)
+            or another registered one.
         updates: total number of critic updates.
         batch_size: transitions in an update.
         num_worlds: number of imagined worlds that are stepped at once.
@@ -51,7 +53,8 @@ class PolicyConfig:
         constants_std: standard deviation that takes the place of the fit's: of a free constant
             relative, of a bounded one of the logit of its place; null for the fit's.
         start: where imagined episodes start.
-        td3: hyper-parameters of TD3.
+        td3: hyper-parameters of TD3; all methods have its networks and γ.
+        analytic: hyper-parameters of policy gradients through the model.
         refit: when and how the critics are fitted to the best actor's returns in the model.
 
     Raises:
@@ -86,6 +89,7 @@ class PolicyConfig:
     constants_std: float | None = None
     start: StartConfig = field(default_factory=StartConfig)
     td3: TD3Config = field(default_factory=TD3Config)
+    analytic: AnalyticConfig = field(default_factory=AnalyticConfig)
     refit: RefitConfig = field(default_factory=RefitConfig)
 
     def __post_init__(self) -> None:
@@ -119,6 +123,8 @@ class PolicyConfig:
         for name in ("max_age", "evaluation_steps", "max_seconds", "constants_std"):
             if getattr(self, name) is not None:
                 check_positive(self, name)
+        if self.method == "analytic":
+            self._check_analytic()
         chunk_updates = self.chunk_steps * self.updates_per_step
         for name, value in (
             ("chunk_steps * updates_per_step", chunk_updates),
@@ -137,4 +143,18 @@ class PolicyConfig:
                     f"refit.{name}",
                     f"expected a multiple of evaluation_interval = {self.evaluation_interval}, "
                     f"got {value}.",
+                )
+
+    def _check_analytic(self) -> None:
+        count = self.analytic.critic_updates
+        for name, value in (
+            ("updates", self.updates),
+            ("evaluation_interval", self.evaluation_interval),
+            ("num_worlds * analytic.horizon", self.num_worlds * self.analytic.horizon),
+        ):
+            if value % count:
+                raise ConfigError(
+                    name,
+                    f"expected a multiple of analytic.critic_updates = {count} with "
+                    f"method=analytic, got {value}.",
                 )

@@ -1,24 +1,16 @@
-"""The base of TD3 in imagination and on real steps: acting, learning from replay, checkpoints."""
+"""The base of TD3 in imagination and on real steps: acting, and learning from replay."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-import torch
 from torch import Tensor
 
-from phihp_torchrl.agents import (
-    FlatReplay,
-    TD3Config,
-    TD3Update,
-    make_td3_loss,
-)
+from phihp_torchrl.agents import TD3Config, TD3Update, make_td3_loss
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.imagination import Rollouts, Worlds, draw_noise
+from phihp_torchrl.imagination import Rollouts, draw_noise
+from phihp_torchrl.trainers.replay_base import ReplayTrainer
 
 
-class TD3Trainer:
+class TD3Trainer(ReplayTrainer):
     """The base of trainers by TD3; subclasses decide when to act and when to learn.
 
     Args:
@@ -29,35 +21,14 @@ class TD3Trainer:
         compile: whether to compile the update.
     """
 
-    replay: FlatReplay
-    worlds: Worlds
+    update: TD3Update
 
     def __init__(
         self, world_model: TaskWorldModel, td3: TD3Config, *, seed: int, compile: bool
     ) -> None:
-        self.task = world_model.task
-        self.generator = torch.Generator().manual_seed(seed)
-        self.loss = make_td3_loss(world_model, td3)
-        self.update = TD3Update(self.loss, world_model, td3, compile=compile)
-        self.updates = 0
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that a resumed run needs, tensors and numbers only."""
-        return {
-            "update": self.update.state_dict(),
-            "replay": self.replay.state_dict(),
-            "worlds": list(self.worlds),
-            "updates": self.updates,
-            "generator": self.generator.get_state(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a :meth:`state_dict`."""
-        self.update.load_state_dict(state["update"])
-        self.replay.load_state_dict(state["replay"])
-        self.worlds = Worlds(*state["worlds"])
-        self.updates = state["updates"]
-        self.generator.set_state(state["generator"])
+        super().__init__(world_model.task, seed)
+        loss = make_td3_loss(world_model, td3)
+        self.update = TD3Update(loss, world_model, td3, compile=compile)
 
     def _act(
         self, world: Rollouts, starts: Tensor, *, noise: float, random_fraction: float
