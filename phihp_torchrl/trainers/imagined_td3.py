@@ -23,11 +23,7 @@ class ImaginedTD3(TD3Trainer):
             imagination.world_model, config.td3, seed=imagination.seed, compile=imagination.compile
         )
         self.replay = imagination.new_replay()
-<<<<<<< HEAD
         self.enter(imagination.new_worlds(self.generator))
-=======
-        self.worlds = imagination.new_worlds(self.generator)
->>>>>>> analytic
 
     @property
     def imagined_steps(self) -> int:

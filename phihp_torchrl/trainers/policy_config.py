@@ -132,11 +132,7 @@ class PolicyConfig:
         for name in ("max_age", "evaluation_steps", "max_seconds", "constants_std"):
             check = check_steps if name in ("max_age", "evaluation_steps") else check_positive
             if getattr(self, name) is not None:
-<<<<<<< HEAD
                 check(self, name)
-=======
-                check_positive(self, name)
->>>>>>> analytic
         if self.method == "analytic":
             self._check_analytic()
         chunk_updates = self.chunk_steps * self.updates_per_step

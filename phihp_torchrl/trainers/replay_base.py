@@ -8,22 +8,14 @@ from typing import Any
 import torch
 
 from phihp_torchrl.agents import ActorCriticUpdate, FlatReplay
-<<<<<<< HEAD
 from phihp_torchrl.imagination import SignalStream, Worlds
-=======
-from phihp_torchrl.imagination import Worlds
->>>>>>> analytic
 from phihp_torchrl.tasks import Task
 
 
 class ReplayTrainer:
     """The base of trainers that step worlds, keep their transitions and update actor and critics.
 
-<<<<<<< HEAD
     Subclasses set :attr:`update` and :attr:`replay`, and :meth:`enter` worlds.
-=======
-    Subclasses set :attr:`update`, :attr:`replay` and :attr:`worlds`.
->>>>>>> analytic
 
     Args:
         task: the task.
@@ -39,7 +31,6 @@ class ReplayTrainer:
         self.task = task
         self.generator = torch.Generator().manual_seed(seed)
         self.updates = 0
-<<<<<<< HEAD
         self.stream: SignalStream | None = None
         """References and inputs of the worlds, for a task that has some."""
 
@@ -50,8 +41,6 @@ class ReplayTrainer:
             self.stream = SignalStream(self.task, len(worlds.age), self.generator)
             state = self.task.with_signals(worlds.state, self.stream.present())
             self.worlds = worlds._replace(state=state)
-=======
->>>>>>> analytic
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
@@ -61,10 +50,7 @@ class ReplayTrainer:
             "worlds": list(self.worlds),
             "updates": self.updates,
             "generator": self.generator.get_state(),
-<<<<<<< HEAD
             **({} if self.stream is None else {"signals": self.stream.state_dict()}),
-=======
->>>>>>> analytic
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -74,8 +60,5 @@ class ReplayTrainer:
         self.worlds = Worlds(*state["worlds"])
         self.updates = state["updates"]
         self.generator.set_state(state["generator"])
-<<<<<<< HEAD
         if self.stream is not None:
             self.stream.load_state_dict(state["signals"])
-=======
->>>>>>> analytic
