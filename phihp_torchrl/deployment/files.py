@@ -300,7 +300,7 @@ def _with_additions(path: Path, task: Task, content: Mapping[str, Any]) -> Task:
                 f"{path}: task {task.name!r} is another one here: expected its {name} {here}, "
                 f"got {saved}."
             )
-    return changed
+    return task if changed == task else changed
 
 
 def _read_weights(
