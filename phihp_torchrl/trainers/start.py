@@ -8,8 +8,9 @@ from typing import Any
 
 from phihp_torchrl.config import ConfigError, differences
 from phihp_torchrl.trainers.checkpoints import load_state
-from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig, read_run_config
+from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
+from phihp_torchrl.trainers.run_request import read_run_config
 
 
 def start_directory(config: RunConfig, path: str | Path | None) -> tuple[RunConfig, RunDirectory]:
