@@ -27,7 +27,8 @@ class Method:
     Args:
         label: the method's name in the paper.
         about: description in one line.
-        phases: names of registered phases, in order.
+        phases: names of registered phases, in order. One whose settings say ``enabled: false`` is
+            not among those of a run.
         acting: how the agent acts, one of ``"hybrid_planner"`` (actor and Q help to plan),
             ``"plain_planner"``, ``"actor"`` and ``"own_planner"`` (a phase makes the planner).
         model_kind: the ``model.kind`` that the method requires; ``None`` if it works with any.

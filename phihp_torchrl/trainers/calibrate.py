@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import logging
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,18 +11,17 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from phihp_torchrl.config import kind_mapping
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.planners import SearchConfig, score_sequences
-from phihp_torchrl.trainers.calibrate_choice import Trial, estimate, grid, rank
+from phihp_torchrl.trainers.calibrate_budget import round_episodes, rounds_cost
+from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
+from phihp_torchrl.trainers.calibrate_end import End
+from phihp_torchrl.trainers.calibrate_report import report, summary, write_table
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.imagined_play import Played, Player
 from phihp_torchrl.trainers.phases import Phase, register_phase
-from phihp_torchrl.trainers.run_directory import write_atomically
-
-_log = logging.getLogger(__name__)
 
 # States of the actor's second halves, for each episode, at which plans say what they promise.
 _PROMISES = 8
@@ -36,10 +33,10 @@ class CalibratePhase:
 
     Every setting of a short grid plans for some steps, from the task's starts and from states in
     the second half of the actor's episodes; then the actor takes over. In each round more steps are
-    planned, by the better half of the settings. Of those within one standard error of the best the
-    smoothest is chosen, and plays whole episodes: it acts if it beats the actor there by more than
-    ``config.confidence`` standard errors, and else the actor does. All of this happens in the
-    model, with the same starts and noise for every setting, so no real step is taken.
+    planned, by the better half of the settings. The first of the last round, the settings as given
+    and the actor then play episodes from other starts, more of them while it is in doubt who is to
+    act, and a rule chooses. All of this happens in the model, with the same starts and noise for
+    every setting, so no real step is taken.
 
     Args:
         agent: the agent, with model, actor and planner; it is not compiled.
@@ -54,7 +51,7 @@ class CalibratePhase:
         >>> task = get_task("pendulum")
         >>> small = CEMConfig(2, optim_steps=1, num_candidates=8, top_k=2, num_policy_candidates=2)
         >>> parts = {"dynamics": HybridDynamics.hybrid(task), "actor": Actor(task)}
-        >>> config = CalibrateConfig(True, episodes=2, rounds=(2,), follow_steps=2)
+        >>> config = CalibrateConfig(True, 2, rounds=(2,), follow_steps=2, max_episodes=2, budget=1)
         >>> phase = CalibratePhase(Agent(task, **parts, planner_config=small), config, seed=0)
         >>> while not phase.done:
         ...     metrics = phase.advance()
@@ -75,21 +72,24 @@ class CalibratePhase:
         self.final: dict[str, Any] = {}
         self.settings: list[dict[str, Any]] = []
         self._players: dict[int, Player] = {}
+        self._count = len(grid(self.base, 1.0, 1.0))  # of settings, at most
+        self._episodes = round_episodes(config, self.base, self._count)
+        spent = rounds_cost(config, self.base, self._episodes, self._count)
+        self.end = End(agent, config, self.world_model, seed, spent)
 
     @property
     def done(self) -> bool:
         """Whether the planner is chosen."""
-        return bool(self.final) or not self.config.enabled
+        return bool(self.final)
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Trials that are done, and all of them, whole episodes being one."""
-        if not self.config.enabled:
-            return 0, 0
-        count, total = len(self.settings) or 11, 1
+        """Trials that are done, and all that are foreseen; at the end, each lot of episodes."""
+        count, total = len(self.settings) or self._count, 0
         for _ in self.config.rounds:
             total, count = total + count, (count + 1) // 2
-        return sum(map(len, self.rounds)) + bool(self.final), total
+        stages = len(self.end.lots)
+        return sum(map(len, self.rounds)) + stages, total + stages + (not self.done)
 
     @property
     def acting(self) -> str:
@@ -102,7 +102,7 @@ class CalibratePhase:
         return replace(self.base, **self.final.get("changes", {}))
 
     def advance(self) -> dict[str, float]:
-        """Try the next setting, or let the chosen one play whole episodes."""
+        """Try the next setting, or let the finalists play some episodes."""
         if not self.settings:
             self._prepare()
         for index, steps in enumerate(self.config.rounds):
@@ -119,12 +119,10 @@ class CalibratePhase:
                     "calibrate/gain_error": trial.standard_error,
                     "calibrate/chatter": trial.chatter,
                 }
-        return self._finish()
+        return self._play_final()
 
     def parts(self) -> dict[str, Any]:
         """The planner's settings and how to act, as arguments of :class:`~phihp_torchrl.Agent`."""
-        if not self.config.enabled:
-            return {}
         return {
             "planner_config": self.planner_config,
             "use_planner": self.acting == "planner",
@@ -136,6 +134,7 @@ class CalibratePhase:
         return {
             "rounds": [[asdict(trial) for trial in trials] for trials in self.rounds],
             "settings": self.settings,
+            "end": self.end.state_dict(),
             "final": self.final,
         }
 
@@ -145,19 +144,21 @@ class CalibratePhase:
             self._prepare()
         self.settings = [dict(changes) for changes in state["settings"]]
         self.rounds = [[_trial(kept) for kept in trials] for trials in state["rounds"]]
+        self.end.load_state_dict(state["end"])
         self.final = dict(state["final"])
 
     def _prepare(self) -> None:
         """Imagine the actor's episodes, and from these the starts and the grid."""
-        task, episodes = self.agent.task, self.config.episodes
+        task, episodes = self.agent.task, self._episodes
         generator = torch.Generator().manual_seed(self.seed)
         device = next(self.agent.parameters()).device
-        starts = [task.sample_start([episodes], generator).to(device) for _ in range(3)]
+        counts = (episodes, episodes, self.config.max_episodes)
+        starts = [task.sample_start([count], generator).to(device) for count in counts]
         played = Player(self.actor, self.world_model, starts[0]).play(task.max_steps)
         share = 0.5 + 0.5 * torch.rand(_PROMISES, episodes, generator=generator).to(device)
         index = (share * played.lengths).long()
         late = played.states.gather(0, index[..., None].expand(-1, -1, task.state_dim))
-        self._starts, self._whole = torch.cat([starts[1], late[0]]), starts[2]
+        self._starts, self.end.starts = torch.cat([starts[1], late[0]]), starts[2]
         steps = self.config.rounds[-1] + self.config.follow_steps
         self._of_actor = Player(self.actor, self.world_model, self._starts).play(steps).total
         reward = (played.total / played.lengths).abs().mean().item()
@@ -196,7 +197,7 @@ class CalibratePhase:
         return self.agent.with_planner(replace(self.base, **changes))
 
     def _try(self, number: int, steps: int) -> Trial:
-        changes, episodes = self.settings[number], self.config.episodes
+        changes, episodes = self.settings[number], self._episodes
         if number not in self._players:  # a resumed run plays again what it had played
             agent = self._planning(changes)
             self._players[number] = Player(agent, self.world_model, self._starts, self.seed)
@@ -214,58 +215,29 @@ class CalibratePhase:
             changes,
             steps,
             tuple(tuple(row) for row in gain.reshape(2, episodes).tolist()),
-            late.chatter(torch.zeros_like(late.lengths)),
+            late.chatter(torch.zeros_like(late.lengths)).mean().item(),
         )
 
-    def _finish(self) -> dict[str, float]:
-        """Let the best setting play whole episodes beside the actor, and decide."""
-        chosen, steps = rank(self.rounds[-1])[0], self.agent.task.max_steps
+    def _play_final(self) -> dict[str, float]:
+        """Let the finalists play episodes of the end, and choose once there are enough."""
         self._players.clear()
-        of_plan, of_actor = (
-            Player(agent, self.world_model, self._whole, self.seed).play(steps)
-            for agent in (self._planning(chosen.changes), self.actor)
-        )
-        gain, error = estimate((of_plan.total - of_actor.total).double()[None])
-        better = gain > self.config.confidence * error
-        self.final = {
-            "acting": "planner" if better else "actor",
-            "changes": dict(chosen.changes),
-            "gain": gain,
-            "gain_error": error,
-            "planner_return": of_plan.total.mean().item(),
-            "actor_return": of_actor.total.mean().item(),
-            "planner_chatter": of_plan.chatter(of_plan.lengths // 2),
-            "actor_chatter": of_actor.chatter(of_actor.lengths // 2),
+        if not self.end.changes:
+            others = [trial.changes for trial in rank(self.rounds[-1]) if trial.changes]
+            self.end.changes = {"given": {}, **({"other": dict(others[0])} if others else {})}
+        self.end.play()
+        choice = self.end.choice()
+        if choice.certain or not self.end.may_go_on():
+            self.final = summary(choice, self.end)
+            report(self.final)
+            if self.path is not None:
+                write_table(self.path, self.final, self.planner_config, self.rounds)
+        numbers = {name: value for name, value in self.final.items() if isinstance(value, float)}
+        numbers |= {"gain": choice.gain, "gain_error": choice.gain_error}
+        return {
+            "calibrate/episodes": float(self.end.episodes),
+            **{f"calibrate/{name}": value for name, value in numbers.items()},
+            "calibrate/acting_planner": float(choice.acting == "planner"),
         }
-        self._report()
-        words = {k: v for k, v in self.final.items() if isinstance(v, float)}
-        metrics = {f"calibrate/{key}": value for key, value in words.items()}
-        return {**metrics, "calibrate/acting_planner": float(better)}
-
-    def _report(self) -> None:
-        final = self.final
-        _log.info(
-            "In imagination the plan with %s earns %+.4g ± %.2g beside the actor (chatter %.3f and "
-            "%.3f); the %s acts.",
-            final["changes"] or "the settings as given",
-            final["gain"],
-            final["gain_error"],
-            final["planner_chatter"],
-            final["actor_chatter"],
-            final["acting"],
-        )
-        if self.path is not None:
-            table = [
-                {
-                    **asdict(trial),
-                    "gain": trial.mean,
-                    "gain_error": trial.standard_error,
-                }
-                for trials in self.rounds
-                for trial in trials
-            ]
-            content = {**final, "planner": kind_mapping(self.planner_config), "trials": table}
-            write_atomically(self.path, json.dumps(content, indent=2) + "\n")
 
 
 def _trial(kept: Mapping[str, Any]) -> Trial:

@@ -1,4 +1,4 @@
-"""Which settings of the planner are compared, and which of them is chosen."""
+"""Which settings of the planner are compared, and which of them go on."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from phihp_torchrl.planners import SearchConfig
+from phihp_torchrl.trainers.calibrate_rule import estimate
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,6 @@ class Trial:
     def standard_error(self) -> float:
         """Standard error of :attr:`mean`."""
         return estimate(torch.tensor(self.differences, dtype=torch.float64))[1]
-
-
-def estimate(differences: Tensor) -> tuple[float, float]:
-    """Sum of the means of rows ``[sorts, episodes]``, and its standard error."""
-    if not differences.isfinite().all():
-        return -math.inf, 0.0
-    variance = differences.var(-1).sum() / differences.shape[-1]
-    return differences.mean(-1).sum().item(), variance.sqrt().item()
 
 
 def rank(trials: Sequence[Trial]) -> list[Trial]:

@@ -12,12 +12,19 @@ class CalibrateConfig:
     """How the planner's settings are compared with the actor in imagined episodes.
 
     Args:
-        enabled: whether to calibrate; false takes the settings of the section planner as they are.
+        enabled: whether to calibrate; false takes the settings of the section planner as they are,
+            and the run has no such phase.
         episodes: paired imagined episodes, and as many starts in the second half of one.
         rounds: steps that each setting plans before the actor takes over, in each round; after a
             round the better half of the settings goes on.
         follow_steps: steps of the actor after those.
-        confidence: standard errors by which a plan must beat the actor in whole episodes to act.
+        confidence: standard errors by which settings must beat those that were given, and by which
+            a plan beats the actor without doubt, in episodes at the end.
+        max_episodes: episodes at the end at most; their number doubles while it is in doubt who is
+            to act.
+        budget: transitions that plans may imagine, of which half is for the rounds; a call of the
+            model counts as a thousand more, so 60 million take about a minute of one core. Two
+            episodes a round, and at the end the steps of the last round, are played in any case.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.
@@ -34,11 +41,15 @@ class CalibrateConfig:
     rounds: tuple[int, ...] = (10, 20, 40)
     follow_steps: int = 100
     confidence: float = 2.0
+    max_episodes: int = 48
+    budget: int = 60_000_000
 
     def __post_init__(self) -> None:
         if not isinstance(self.enabled, bool):
             raise ConfigError("enabled", f"expected true or false, got {self.enabled!r}.")
         check_count(self, "episodes", least=2)
+        check_count(self, "budget")
+        check_count(self, "max_episodes", least=self.episodes)
         check_count(self, "follow_steps", least=0)
         check_not_negative(self, "confidence")
         rounds = self.rounds

@@ -28,11 +28,11 @@ class Played(NamedTuple):
     lengths: Tensor
     changes: Tensor
 
-    def chatter(self, start: Tensor) -> float:
-        """Mean change of the action from step ``start`` ``[N]`` of each episode to its end."""
+    def chatter(self, start: Tensor) -> Tensor:
+        """Mean change of the action from step ``start`` of each episode to its end, ``[N]``."""
         step = torch.arange(len(self.changes), device=start.device)[:, None]
         counts = (step >= start.clamp_min(1)) & (step < self.lengths)
-        return ((self.changes * counts).sum(0) / counts.sum(0).clamp_min(1)).mean().item()
+        return (self.changes * counts).sum(0) / counts.sum(0).clamp_min(1)
 
 
 class Player:
@@ -61,9 +61,13 @@ class Player:
 
     @torch.no_grad()
     def play(self, steps: int) -> Played:
-        """Play on until ``steps`` steps are played in all; returns the whole episodes."""
+        """Play on until ``steps`` steps are played in all, or all episodes are over.
+
+        Returns:
+            The episodes from their start.
+        """
         scale = self.world_model.task.bounds.scale.to(self._total.device)
-        while len(self._changes) < steps:
+        while len(self._changes) < steps and self._alive.any():
             state, start = self._states[-1], self._last is None
             seen = TensorDict(
                 observation=self.world_model.observe(state),
@@ -80,9 +84,9 @@ class Player:
             self._alive = self._alive & ~terminated
             # An episode that is over stands still, so that nothing in it overflows.
             self._states.append(torch.where(self._alive[:, None], following, state))
-        return Played(
-            torch.stack(self._states), self._total, self._lengths, torch.stack(self._changes)
-        )
+        none = self._total.new_zeros(0, len(self._total))
+        changes = torch.stack(self._changes) if self._changes else none
+        return Played(torch.stack(self._states), self._total, self._lengths, changes)
 
     def followed_by(self, actor: Agent, steps: int) -> Tensor:
         """Returns ``[N]`` if ``actor`` plays ``steps`` steps after what has been played."""

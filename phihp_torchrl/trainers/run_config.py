@@ -38,7 +38,8 @@ class RunConfig:
         method: name of the method (phihp list prints them).
         preset: name of the set of hyper-parameters; only recorded here.
         seed: seed of all random numbers.
-        phases: the phases to run, consecutive ones of the method; null for all of them.
+        phases: the phases to run, consecutive ones of the method; null for all of them. Those with
+            a switch (enabled) need not be named between others.
         start_from: directory of a run that has done the earlier phases; needed if phases does not
             begin with the first one.
         plugins: Python files or modules to import, which register tasks, worlds and so on.
@@ -69,7 +70,7 @@ class RunConfig:
         >>> from phihp_torchrl.trainers import read_run_config
         >>> config = read_run_config(load_config("pendulum", overrides=["policy.updates=100"]))
         >>> config.section("policy").updates, config.phases
-        (100, ('model', 'policy', 'calibrate', 'evaluate'))
+        (100, ('model', 'policy', 'evaluate'))
     """
 
     task: str
@@ -105,9 +106,9 @@ class RunConfig:
         object.__setattr__(self, "sections", sections)
         self._check_planner(method)
         self._check_model_kind(method)
-        if self.phases is None:
-            object.__setattr__(self, "phases", method.phases)
-        self._check_phases(method.phases)
+        if self.phases is None or tuple(self.phases) == method.phases:
+            object.__setattr__(self, "phases", self.all_phases)
+        object.__setattr__(self, "phases", self._checked_phases())
 
     def section(self, name: str) -> Any:
         """Return the settings of the phase ``name``.
@@ -132,15 +133,20 @@ class RunConfig:
         return f"{method}{self.preset}-seed{self.seed}"
 
     @property
+    def all_phases(self) -> tuple[str, ...]:
+        """The phases of the method, without those whose settings say ``enabled: false``."""
+        names = get_method(self.method).phases
+        return tuple(name for name in names if is_enabled(self.sections[name]))
+
+    @property
     def phases_before(self) -> tuple[str, ...]:
-        """The phases of the method that come before those of this run."""
-        phases = get_method(self.method).phases
-        return phases[: phases.index(self.phases_to_do[0])]
+        """The phases of :attr:`all_phases` that come before those of this run."""
+        return self.all_phases[: self.all_phases.index(self.phases_to_do[0])]
 
     @property
     def phases_to_do(self) -> tuple[str, ...]:
         """The phases of this run."""
-        return self.phases or get_method(self.method).phases
+        return self.phases or self.all_phases
 
     def _check_planner(self, method: Method) -> None:
         if not method.plans:
@@ -163,10 +169,19 @@ class RunConfig:
                 f"expected {method.model_kind!r} for method {self.method!r}, got {kind!r}.",
             )
 
-    def _check_phases(self, known: tuple[str, ...]) -> None:
-        ours = self.phases or ()
-        first = known.index(ours[0]) if ours and ours[0] in known else 0
-        if not ours or tuple(ours) != known[first : first + len(ours)]:
+    def _checked_phases(self) -> tuple[str, ...]:
+        """The phases of this run, with those between them that are switched on."""
+        ours, known = tuple(self.phases or ()), self.all_phases
+        for name in ours:
+            if name in self.sections and name not in known:
+                raise ConfigError(
+                    f"{name}.enabled", f"expected true, for phases={list(ours)}; got false."
+                )
+        inside = bool(ours) and {ours[0], ours[-1]} <= set(known)
+        first = known.index(ours[0]) if inside else 0
+        stretch = known[first : known.index(ours[-1]) + 1] if inside else ()
+        optional = [name for name in stretch if hasattr(self.sections[name], "enabled")]
+        if not ours or ours != tuple(n for n in stretch if n in ours or n not in optional):
             raise ConfigError(
                 "phases",
                 f"expected consecutive ones of {list(known)}, those of method {self.method!r}, "
@@ -180,6 +195,12 @@ class RunConfig:
             )
         if first == 0 and self.start_from is not None:
             raise ConfigError("from", "expected none, for phases begin with the first one.")
+        return stretch
+
+
+def is_enabled(section: Any) -> bool:
+    """Whether a run with these settings of a phase has it; an optional one has ``enabled``."""
+    return getattr(section, "enabled", True)
 
 
 def task_of(config: RunConfig, task: Task | None = None) -> Task:

@@ -91,6 +91,7 @@ class RunDirectory:
 
 def _complete(config: dict[str, Any]) -> dict[str, Any]:
     """Add to the sections of an older run the settings that say what it did without them."""
+    config.setdefault("calibrate", {"enabled": False})
     for (phase, *path), value in _BEFORE.items():
         section: Any = config.get(phase)
         for key in path[:-1] if isinstance(section, dict) else ():

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from pathlib import Path
 from typing import Any
 
-from phihp_torchrl.config import ConfigError, differences
+from phihp_torchrl.config import ConfigError, differences, get_method
 from phihp_torchrl.trainers.checkpoints import load_state
-from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig
+from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig, is_enabled
 from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
 from phihp_torchrl.trainers.run_request import read_run_config
+
+_log = logging.getLogger(__name__)
 
 
 def start_directory(config: RunConfig, path: str | Path | None) -> tuple[RunConfig, RunDirectory]:
@@ -50,10 +53,28 @@ def _adopt(config: RunConfig) -> RunConfig:
             "from", f"{source.path} is of task {theirs['task']!r}, not {config.task!r}."
         )
     ours = config.to_mapping()
-    for name in config.phases_before:
+    names = get_method(config.method).phases
+    for name in names[: names.index(config.phases_to_do[0])]:
+        optional = hasattr(config.section(name), "enabled")
+        if optional and not _has_done(source, theirs, name):
+            if is_enabled(config.section(name)):
+                _log.warning(
+                    "%s has no phase %r, so this run has none either; to have it, begin with it: "
+                    "phases=%s.",
+                    source.path,
+                    name,
+                    str([name, *config.phases_to_do]).replace("'", ""),
+                )
+            ours[name]["enabled"] = False
+            continue
         load_state(source.phase(name), metadata={"task": config.task})
         ours[name] = theirs[name]
     return read_run_config(ours)
+
+
+def _has_done(source: RunDirectory, settings: dict[str, Any], name: str) -> bool:
+    """Whether a run of these settings has done an optional phase."""
+    return bool(settings.get(name, {}).get("enabled")) and source.phase(name).exists()
 
 
 def _read_config(directory: RunDirectory) -> dict[str, Any]:

@@ -10,11 +10,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, load_config, save_agent
+from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, save_agent
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
-from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, read_run_config, run
+from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, run
 from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
 
 from .run_parts import CONFIG, with_sections
@@ -22,7 +22,7 @@ from .run_parts import CONFIG, with_sections
 SMALL = CEMConfig(
     planning_horizon=3, optim_steps=1, num_candidates=32, top_k=4, num_policy_candidates=2
 )
-TINY = CalibrateConfig(enabled=True, episodes=3, rounds=(3, 6), follow_steps=4)
+TINY = CalibrateConfig(enabled=True, episodes=3, rounds=(3, 6), follow_steps=4, max_episodes=6)
 
 
 def make_agent(name="brief-pendulum", planner=SMALL, last_layer=1.0):
@@ -108,6 +108,8 @@ def test_where_no_plan_is_better_the_actor_acts():
     same = replace(SMALL, num_candidates=2, top_k=1, policy_noise=0.0)
     phase = finished(make_agent(planner=same))
     assert phase.final["gain"] == 0.0
+    assert phase.final["certain"] is True
+    assert phase.final["episodes"] == TINY.episodes  # no more are needed
     assert phase.parts()["use_planner"] is False
     assert phase.parts()["metadata"]["acting"] == "actor"
 
@@ -128,15 +130,6 @@ def test_the_same_seed_chooses_the_same_wherever_it_is_interrupted():
     assert torch.equal(before, torch.random.get_rng_state())  # the noise is its own
 
 
-def test_switched_off_it_has_nothing_to_do():
-    phase = CalibratePhase(make_agent(), CalibrateConfig(enabled=False), seed=0)
-    assert (phase.done, phase.progress, phase.parts()) == (True, (0, 0), {})
-    paper = read_run_config(load_config("pendulum", preset="paper"))
-    assert paper.section("calibrate").enabled is False
-    asked = read_run_config(load_config("pendulum", overrides=["calibrate.enabled=true"]))
-    assert asked.section("calibrate").enabled is True
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -145,11 +138,33 @@ def test_switched_off_it_has_nothing_to_do():
         ({"rounds": ()}, "rounds: expected rising whole numbers >= 2"),
         ({"rounds": (4, 4)}, "rounds: expected rising whole numbers >= 2"),
         ({"confidence": -1.0}, "confidence: expected a number >= 0"),
+        ({"max_episodes": 5}, "max_episodes: expected a whole number >= 6, got 5"),
+        ({"budget": 0}, "budget: expected a .*whole number.*, got 0"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(wrong, message):
     with pytest.raises(ConfigError, match=message):
         CalibrateConfig(**wrong)
+
+
+def test_in_doubt_more_episodes_are_played_up_to_the_limit(caplog):
+    """No gain is above so many standard errors."""
+    phase = finished(make_agent(), replace(TINY, confidence=1e6))
+    assert phase.final["episodes"] == TINY.max_episodes
+    assert [lot["episodes"] for lot in phase.end.lots] == [3, 3]
+    assert phase.final["certain"] is False
+    assert "Raise calibrate.max_episodes" in caplog.text
+    gain, error = phase.final["gain"], phase.final["gain_error"]
+    assert (phase.acting == "planner") == (gain > error)
+    # The lots are from different starts.
+    assert len(set(phase.end.finalists()["actor"].returns)) == TINY.max_episodes
+
+
+def test_the_budget_ends_doubt_and_shortens_plans():
+    small = finished(make_agent(), replace(TINY, confidence=1e6, budget=100_000))
+    assert small.final["episodes"] == TINY.episodes
+    assert small.final["steps"] == TINY.rounds[-1]
+    assert finished(make_agent()).final["steps"] == 20  # the whole episode
 
 
 # The agent that is shipped.

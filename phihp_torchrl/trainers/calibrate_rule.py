@@ -1,0 +1,131 @@
+"""The rule by which settings of the planner, or the actor, are chosen from imagined episodes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+# Of the plan's gain over the actor, what smoothness may cost.
+_SHARE = 0.1
+# Of a paired standard error, what smoothness may cost.
+_DOUBT = 0.5
+# Chatter of the smoother plan, as a share of the other's; and the least difference of the two.
+_SMOOTHER, _NOTICEABLE = 0.5, 0.01
+
+
+@dataclass(frozen=True)
+class Finalist:
+    """What a way to act earned in imagined episodes.
+
+    Args:
+        returns: return of each episode, from the same starts and with the same noise for all.
+        chatter: mean change of the action in each, in units of the half-range.
+        changes: what it changes in the settings of the planner.
+    """
+
+    returns: tuple[float, ...]
+    chatter: tuple[float, ...]
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def mean_chatter(self) -> float:
+        """Mean of the chatter over episodes."""
+        return sum(self.chatter) / len(self.chatter)
+
+    @property
+    def fails(self) -> bool:
+        """Whether a return is not finite."""
+        return not all(map(math.isfinite, self.returns))
+
+    def ahead_of(self, other: Finalist) -> tuple[float, float]:
+        """Mean paired difference of the returns, and its standard error."""
+        ours, theirs = (torch.tensor(each.returns).double() for each in (self, other))
+        return estimate((ours - theirs)[None])
+
+
+class Choice(NamedTuple):
+    """What :func:`choose` has chosen.
+
+    Attributes:
+        plan: the plan.
+        reason: why this one: ``"as given"``, ``"better"`` or ``"smoother"``.
+        acting: who acts, ``"planner"`` or ``"actor"``.
+        certain: whether more episodes would not change who acts.
+        gain: mean return of the plan beyond the actor's.
+        gain_error: its standard error, paired.
+    """
+
+    plan: Finalist
+    reason: str
+    acting: str
+    certain: bool
+    gain: float
+    gain_error: float
+
+
+def choose(
+    given: Finalist, other: Finalist | None, actor: Finalist, *, confidence: float = 2.0
+) -> Choice:
+    """Choose between the plan as given and one other, and between the plan and the actor.
+
+    The plan as given stays unless the other one
+
+    - earns more, by over ``confidence`` standard errors of the paired differences, or
+    - is clearly smoother, with at most half the chatter, and does not earn less by more than a
+      tenth of the given plan's gain over the actor, nor by more than half a standard error.
+
+    The plan that is chosen acts if its mean gain over the actor is above one standard error. Above
+    ``confidence`` of them this is certain; so is a gain of exactly zero, where the two do the same
+    and the actor, which is cheaper, acts. All else is doubtful and deserves more episodes before
+    the actor replaces a plan.
+
+    One other plan is compared and not a dozen, because the best of a dozen looks better than it is.
+    The one that enters here was picked by other episodes, so its differences here are not favoured
+    by the pick. Episodes that are added in doubt are a second look at the same question, which a
+    bound of two standard errors passes a little more often than one look would; they can only keep
+    a plan from being dropped, and never change the settings for less than the rule above asks.
+
+    Args:
+        given: the plan with the settings as they are.
+        other: the plan that may replace it; ``None`` for none.
+        actor: the actor alone.
+        confidence: standard errors of a difference that is no chance.
+
+    Examples:
+        >>> given = Finalist((10.0, 12.0, 11.0), (0.4, 0.4, 0.4))
+        >>> smooth = Finalist((10.0, 12.1, 11.0), (0.1, 0.1, 0.1), {"change_cost": 1.0})
+        >>> actor = Finalist((5.0, 6.0, 7.0), (0.0, 0.0, 0.0))
+        >>> choice = choose(given, smooth, actor)
+        >>> choice.reason, choice.acting, choice.certain
+        ('smoother', 'planner', True)
+    """
+    plan, reason = given, "as given"
+    if other is not None:
+        ahead, error = other.ahead_of(given)
+        allowed = min(_SHARE * max(given.ahead_of(actor)[0], 0.0), _DOUBT * error)
+        chatter, less = given.mean_chatter, other.mean_chatter
+        smoother = less <= _SMOOTHER * chatter and chatter - less >= _NOTICEABLE
+        if ahead > confidence * error or (given.fails and not other.fails):
+            plan, reason = other, "better"
+        elif ahead >= -allowed and smoother:
+            plan, reason = other, "smoother"
+    gain, error = plan.ahead_of(actor)
+    acts = gain > min(confidence, 1.0) * error
+    certain = gain > confidence * error or gain == error == 0.0
+    return Choice(plan, reason, "planner" if acts else "actor", certain, gain, error)
+
+
+def estimate(differences: Tensor) -> tuple[float, float]:
+    """Sum of the means of rows ``[sorts, episodes]``, and its standard error.
+
+    It is minus infinity where a difference is not finite.
+    """
+    if not differences.isfinite().all():
+        return -math.inf, 0.0
+    variance = differences.var(-1).sum() / differences.shape[-1]
+    return differences.mean(-1).sum().item(), variance.sqrt().item()

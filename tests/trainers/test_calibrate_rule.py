@@ -1,0 +1,110 @@
+"""The rule of choice, by numbers made by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from phihp_torchrl.trainers.calibrate_rule import Finalist, choose
+
+
+def way(*returns: float, chatter: float = 0.4, changes: dict | None = None) -> Finalist:
+    return Finalist(returns, (chatter,) * len(returns), changes or {})
+
+
+ACTOR = way(0.0, 0.0, 0.0, 0.0, chatter=0.0)
+GIVEN = way(9.0, 11.0, 9.0, 11.0)  # a gain of 10
+OTHER = {"alpha": 0.5}
+
+
+def chosen(*returns: float, chatter: float) -> str:
+    """Why the plan is chosen if another earns these returns."""
+    return choose(GIVEN, way(*returns, chatter=chatter, changes=OTHER), ACTOR).reason
+
+
+# The settings as given, or others.
+
+
+def test_the_settings_as_given_stay_where_others_are_better_by_noise_alone() -> None:
+    # + 1 on average, with a paired standard error of 1.08
+    assert chosen(13.0, 11.0, 11.0, 9.0, chatter=0.4) == "as given"
+
+
+def test_the_noise_is_that_of_the_pairs() -> None:
+    """Returns scatter by 1.2, the differences by 0.06."""
+    assert chosen(9.9, 12.0, 10.1, 12.0, chatter=0.4) == "better"
+
+
+def test_better_ones_may_chatter_more() -> None:
+    assert chosen(19.0, 21.0, 19.5, 21.0, chatter=0.9) == "better"
+
+
+@pytest.mark.parametrize(
+    ("chatter", "reason"), [(0.2, "smoother"), (0.21, "as given"), (0.0, "smoother")]
+)
+def test_of_equal_gain_half_the_chatter_is_needed(chatter: float, reason: str) -> None:
+    assert chosen(9.0, 11.0, 9.0, 11.0, chatter=chatter) == reason
+
+
+def test_chatter_that_nobody_notices_changes_nothing() -> None:
+    calm = way(9.0, 11.0, 9.0, 11.0, chatter=0.005)
+    other = way(9.0, 11.0, 9.0, 11.0, chatter=0.0, changes=OTHER)
+    assert choose(calm, other, ACTOR).reason == "as given"
+
+
+def test_smoothness_may_cost_half_a_standard_error() -> None:
+    # - 0.4 with a paired error of 0.9, then of 0.04; a tenth of the gain is 1
+    assert chosen(6.6, 10.6, 8.6, 12.6, chatter=0.1) == "smoother"
+    assert chosen(8.5, 10.6, 8.7, 10.6, chatter=0.1) == "as given"
+
+
+def test_smoothness_may_cost_a_tenth_of_the_gain_at_most() -> None:
+    # - 1.25 with a paired error of 2.8
+    assert chosen(1.0, 17.0, 6.0, 11.0, chatter=0.0) == "as given"
+
+
+def test_where_the_plan_gains_nothing_smoothness_must_be_free() -> None:
+    given, actor = way(-1.0, 1.0, -1.0, 1.0), ACTOR
+    worse = way(-1.1, 1.0, -1.0, 1.05, chatter=0.0, changes=OTHER)
+    assert choose(given, worse, actor).reason == "as given"
+    free = way(-1.0, 1.0, -1.0, 1.0, chatter=0.0, changes=OTHER)
+    assert choose(given, free, actor).plan == free
+
+
+# The plan, or the actor.
+
+
+@pytest.mark.parametrize(
+    ("returns", "acting", "certain"),
+    [
+        ((9.0, 11.0, 9.0, 11.0), "planner", True),  # 10 ± 0.6
+        ((-1.0, 4.0, -1.0, 5.0), "planner", False),  # 1.75 ± 1.6
+        ((-1.5, 4.0, -1.5, 5.0), "actor", False),  # 1.5 ± 1.8
+        ((-3.0, 4.0, -3.0, 3.0), "actor", False),  # 0.25 ± 1.9
+        ((-9.0, -11.0, -9.0, -11.0), "actor", False),  # more is asked before a plan is dropped
+        ((0.0, 0.0, 0.0, 0.0), "actor", True),  # they do the same
+    ],
+)
+def test_a_plan_acts_above_one_standard_error(
+    returns: tuple[float, ...], acting: str, certain: bool
+) -> None:
+    choice = choose(way(*returns), None, ACTOR)
+    assert choice.gain == pytest.approx(sum(returns) / 4)
+    assert (choice.acting, choice.certain) == (acting, certain)
+
+
+def test_where_confidence_is_below_one_so_is_the_bound() -> None:
+    doubtful = way(-3.0, 4.0, -3.0, 3.0)
+    assert choose(doubtful, None, ACTOR, confidence=0.0).acting == "planner"
+
+
+# What is not finite.
+
+
+def test_a_return_that_is_not_finite_is_never_chosen() -> None:
+    bad = way(math.nan, 99.0, 99.0, 99.0, chatter=0.0, changes=OTHER)
+    assert choose(GIVEN, bad, ACTOR).reason == "as given"
+    assert choose(bad, None, ACTOR).acting == "actor"
+    good = way(9.0, 11.0, 9.0, 11.0, changes=OTHER)
+    assert choose(bad, good, ACTOR).plan == good
