@@ -52,7 +52,7 @@ class Context:
 
     @property
     def planner(self) -> SearchConfig | None:
-        """Settings of the planner, with what phases had to change, such as the critics' discount."""
+        """Settings of the planner, with what phases changed, such as the critics' discount."""
         planner = self.config.planner
         changes: dict[str, Any] = {}
         for phase in self.before.values():
