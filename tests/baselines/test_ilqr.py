@@ -120,7 +120,7 @@ def test_it_reckons_with_what_is_under_way_and_with_a_reference() -> None:
     def follow(state, action, next_state, reference):
         return -(next_state[..., 0] - reference[..., 0]).square() - 1e-3 * action[..., 0] ** 2
 
-    to = replace(push(reference=Signal(("x",), (-1.0,), (1.0,))), reward=follow)
+    to = replace(push(), reference=Signal(("x",), (-1.0,), (1.0,)), reward=follow)
     ilqr = ILQR.from_model(to, prior_of(to), config)
     assert ilqr.problem.lqr is None
     state = to.with_signals(to.at_rest(torch.zeros(2, 2)), torch.tensor([[0.5], [-0.5]]))
