@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from phihp_torchrl.baselines.controller import Controller
 from phihp_torchrl.baselines.energy_shaping import EnergyShaping, PumpConfig
+from phihp_torchrl.baselines.ilqr import ILQR, ILQRConfig
 from phihp_torchrl.baselines.lqr import LQR
 from phihp_torchrl.baselines.pid import PID
 from phihp_torchrl.baselines.registry import (
@@ -14,4 +15,4 @@ from phihp_torchrl.baselines.registry import (
     register_baseline,
 )
 
-__all__ = ["LQR", "PID", "EnergyShaping", "make_baselines", "register_baseline"]
+__all__ = ["ILQR", "LQR", "PID", "EnergyShaping", "make_baselines", "register_baseline"]

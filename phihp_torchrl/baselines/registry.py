@@ -11,6 +11,7 @@ from torch import nn
 
 from phihp_torchrl.baselines.energy import starts_low
 from phihp_torchrl.baselines.energy_shaping import EnergyShaping
+from phihp_torchrl.baselines.ilqr import ILQR
 from phihp_torchrl.baselines.lqr import LQR
 from phihp_torchrl.baselines.pid import PID
 from phihp_torchrl.config import ConfigError, Registry
@@ -159,4 +160,7 @@ register_baseline(
 )
 register_baseline(
     "mppi", _mppi, about="model-predictive path integral control without a policy", slow=True
+)
+register_baseline(
+    "ilqr", ILQR.from_model, about="model-predictive control by iterative LQR", slow=True
 )
