@@ -1,0 +1,80 @@
+"""The recipe of a plant behind a socket: the loop answers, and missed deadlines are counted."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import socket
+import struct
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from phihp_torchrl import Agent, save_agent
+from phihp_torchrl.deployment import Controller, Safety
+
+from .agent_parts import make_agent
+
+ROOT = Path(__file__).parents[2]
+RECIPE = runpy.run_path(str(ROOT / "recipes" / "socket_loop.py"))
+
+
+def listen() -> socket.socket:
+    line = socket.socket(type=socket.SOCK_DGRAM)
+    line.bind(("127.0.0.1", 0))
+    line.settimeout(20.0)
+    return line
+
+
+def plant(line: socket.socket, rate: float, ticks: int) -> threading.Thread:
+    arguments = ("pendulum", rate, ticks, line.getsockname())
+    thread = threading.Thread(target=RECIPE["serve"], args=arguments, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_an_actor_controls_a_plant_at_50_hz():
+    controller = Controller(make_agent(use_planner=False), safety=Safety(deadline=1.0))
+    controller.warm_up(1)
+    with listen() as line:
+        thread = plant(line, 50.0, 50)
+        ticks, missed = RECIPE["control"](controller, line)
+        thread.join(5.0)
+    controller.close()
+    report = controller.report()
+    assert ticks == report.steps == 50
+    assert missed < 50, "no command has ever come in time"
+    assert not report.reasons
+
+
+def test_a_plant_without_an_answer_misses_every_tick_but_the_first():
+    """The first tick comes before the first sample, so that no command can be there."""
+    samples = []
+    with listen() as line:
+        plant(line, 200.0, 6)
+        while packet := line.recv(1024):
+            samples.append(packet)
+    numbers = [struct.unpack("=iid3f", packet)[:2] for packet in samples]
+    assert numbers == [(0, 0), (1, 1), (2, 2), (3, 3), (4, 4), (5, 5)]
+
+
+@pytest.mark.slow
+def test_the_recipe_and_what_measures_it_run(tmp_path: Path) -> None:
+    agent: Agent = make_agent()
+    save_agent(agent, tmp_path / "agent")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    options = ("--rates", "50", "--seconds", "0.2")
+    recipe = [sys.executable, ROOT / "recipes" / "socket_loop.py", tmp_path / "agent", *options]
+    printed = subprocess.run(recipe, env=environment, capture_output=True, text=True, check=True)
+    assert "of 10 |" in printed.stdout
+    out = tmp_path / "realtime"
+    script = ROOT / "benchmarks" / "paper" / "control_loops.py"
+    words = ["--agent", tmp_path / "agent", "--out", out, "--acting", "actor", *options]
+    subprocess.run([sys.executable, script, *words], env=environment, check=True)
+    (row,) = json.loads((out / "realtime.json").read_text())["rows"]
+    assert (row["acting"], row["ticks"]) == ("actor", 10)
+    assert "| actor | 50 | 10 |" in (out / "README.md").read_text()
