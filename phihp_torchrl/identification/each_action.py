@@ -1,0 +1,118 @@
+"""A dead time and a lag for each action, where one for all of them does not explain the data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from phihp_torchrl.identification.model import Model, part_of
+from phihp_torchrl.identification.trials import Trial
+from phihp_torchrl.tasks import Numbers
+
+if TYPE_CHECKING:
+    from phihp_torchrl.identification.choices import Chooser
+
+
+def each(value: Numbers, count: int) -> list[float]:
+    """The numbers of ``count`` actions."""
+    return list(value) if isinstance(value, tuple) else [value] * count
+
+
+def in_words(value: Numbers) -> str:
+    """One number, or one for each action.
+
+    Examples:
+        >>> in_words(2.0), in_words((0.0, 2.0))
+        ('2', '0 and 2')
+    """
+    return " and ".join(f"{v:g}" for v in (value if isinstance(value, tuple) else (value,)))
+
+
+def with_delays(model: Model, delays: Sequence[float] | float) -> Model:
+    """A model with other delays, which are not fitted, and without a lag that was."""
+    kept = tuple(name for name in model.fitted if part_of(name)[0] not in ("delay_steps", "lag"))
+    had_lag = any(part_of(name)[0] == "lag" for name in model.fitted)
+    delay = float(delays) if isinstance(delays, (int, float)) else tuple(delays)
+    free = {"delay_steps": delay, **({"lag": 0.0} if had_lag else {})}
+    return replace(model, fitted=kept, path=replace(model.path, **free))
+
+
+def delay_each(chooser: Chooser, moving: Sequence[int]) -> None:
+    """Change the delay of one action after the other, where that is clearly better.
+
+    Args:
+        chooser: what tries models; its best one is the first guess.
+        moving: the actions whose commands change.
+    """
+    names = chooser.best.model.actions
+    for i in moving:
+        for direction in (1, -1):
+            delays = each(chooser.delay(), len(names))
+            begin = best = delays[i]
+            # One step may not help where two do.
+            for ahead in range(1, chooser.config.largest_delay + 1):
+                delays[i] = begin + direction * ahead
+                near = abs(delays[i] - best) <= 2.0
+                if not near or not 0.0 <= delays[i] <= chooser.config.largest_delay:
+                    break
+                label = f"delay {delays[i]:g} of {names[i]}"
+                trial = chooser.consider(label, with_delays(chooser.best.model, delays))
+                if chooser.trials.better(trial, chooser.best):
+                    chooser.best, best = trial, delays[i]
+            if best != begin:
+                break
+
+
+def lag_each(chooser: Chooser, moving: Sequence[int]) -> None:
+    """A lag for each action in the place of one for all; else one for single actions.
+
+    Args:
+        chooser: what tries models; its best one is the first guess.
+        moving: the actions whose commands change.
+    """
+    if "lag" in chooser.best.model.fitted:
+        _part_lag(chooser, moving)
+        return
+    names = chooser.best.model.actions
+    for i in moving:
+        base, delays = chooser.best, each(chooser.delay(), len(names))
+        had, shorter = delays[i], {0.0, float(int(delays[i]) // 2), float(round(delays[i]))}
+        for dead in sorted(shorter) if chooser.config.delay == "auto" else [had]:
+            delays[i] = dead
+            model = replace(base.model, path=replace(base.model.path, delay_steps=tuple(delays)))
+            start = max(had - dead, 0.5) * chooser.trials.samples.step
+            label = f"delay {dead:g}, lag of {names[i]}" if dead else f"lag of {names[i]}"
+            trial = chooser.consider(label, model.with_part("lag", start, i))
+            instead = chooser.best is base and not dead and had > 0  # one number for another
+            if chooser.lower(trial) if instead else chooser.trials.better(trial, chooser.best):
+                chooser.best = trial
+
+
+def _part_lag(chooser: Chooser, moving: Sequence[int]) -> None:
+    """Try a lag for each action, and then without those that do not help."""
+    best = chooser.best
+    names, path = best.model.actions, best.model.actuator(best.raw)
+    others = tuple(name for name in best.model.fitted if name != "lag")
+    lag = max(each(path.lag, len(names)))
+    model = replace(best.model, fitted=others, path=replace(path, lag=0.0))
+    for i in moving:
+        model = model.with_part("lag", lag, i)
+    parted = chooser.consider("a lag of each action", model)
+    if not chooser.trials.better(parted, best):
+        return
+    chooser.best = parted
+    for i in moving:
+        rich = chooser.best
+        trial = chooser.consider(f"no lag of {names[i]}", _without_lag(rich, i))
+        if not chooser.trials.better(rich, trial):
+            chooser.best = trial
+
+
+def _without_lag(trial: Trial, i: int) -> Model:
+    """The model of a trial, with its numbers as first guesses, and no lag of one action."""
+    model, path = trial.model, trial.model.actuator(trial.raw)
+    lags = each(path.lag, len(model.actions))
+    lags[i] = 0.0
+    kept = tuple(n for n in model.fitted if part_of(n) != ("lag", model.actions[i]))
+    return replace(model, fitted=kept, path=replace(path, lag=tuple(lags)))
