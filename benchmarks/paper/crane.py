@@ -1,11 +1,11 @@
 """A crane in newtons and kilograms, learned in its own units, beside LQR and PID.
 
     python benchmarks/paper/crane.py --seed 100
-    python benchmarks/paper/crane.py --seed 100 --single --updates 3000
+    python benchmarks/paper/crane.py --seed 100 --single --updates 2500
 
-Learns ``rigs/heavy_crane.py``, whose forces are ±4000 N and whose masses are hundreds of kg, from real
-steps of its simulated world with friction, with ``policy.scales=auto`` and a small budget. The LQR
-and the PID are built in the model that was learned, and all are played in the same episodes of
+Learns ``rigs/heavy_crane.py``, whose forces are ±4000 N and whose masses are hundreds of kg, from
+real steps of its simulated world with friction, with ``policy.scales=auto`` and a small budget. The
+LQR and the PID are built in the model that was learned, and all are played in the same episodes of
 evaluation. With ``--single`` the settings of the policy are kept even where they seem to fail in
 imagination, and no other strategy is tried. Writes results/crane/.
 """
@@ -52,7 +52,7 @@ _LOGGED = ("model/held_out_error", "model/rollout_error_20", "policy/imagined_re
 
 def last_metrics(path: Path) -> dict[str, float]:
     """The last value of each of the metrics that the page shows."""
-    found = {}
+    found: dict[str, float] = {}
     for row in csv.DictReader(path.read_text().splitlines()):
         found |= {name: float(row[name]) for name in _LOGGED if row.get(name)}
     return found
@@ -98,8 +98,9 @@ def write(result: Mapping[str, Any], results: Path) -> None:
         text += [
             controllers_table(title, every["results"]),
             f"{count} episodes; {every['settings']['model.real_steps']} real steps, "
-            f"{every['settings']['policy.updates']} updates a strategy at most, {every['seconds']:.0f} s in all. At "
-            f"the end of training: {metrics}. Made at commit {commit_text(every['origin'])}, "
+            f"{every['settings']['policy.updates']} updates a strategy at most, "
+            f"{every['seconds']:.0f} s in all. At the end of training: {metrics}. "
+            f"Made at commit {commit_text(every['origin'])}, "
             f"{machine_text(every['origin'])}, shared with other work.\n",
         ]
     (results / "README.md").write_text("\n".join(text))
