@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from phihp_torchrl.identification.config import AUTO, IdentifyConfig
-from phihp_torchrl.identification.each_action import delay_each, in_words, lag_each, with_delays
+from phihp_torchrl.identification.each_action import delay_each, in_words, with_delays
 from phihp_torchrl.identification.model import Model, part_of
 from phihp_torchrl.identification.parts import ActuatorTrial
 from phihp_torchrl.identification.trials import Trial, Trials
@@ -49,16 +49,13 @@ class Chooser:
     def choose_all(self) -> None:
         """Delay, lag, the other parts, and the integrator, in this order.
 
-        Where several actions move, each may have its own delay and lag.
+        Where several actions move, each may have its own delay.
         """
         self.choose_delay()
         moving = self._moving()
-        several = len(moving) > 1
-        if several and self.config.delay == AUTO:
+        if len(moving) > 1 and self.config.delay == AUTO:
             delay_each(self, moving)
         self.choose_lag()
-        if several and self.config.lag == AUTO:
-            lag_each(self, moving)
         self.choose_slew()
         self.choose_parts()
         self.choose_integrator()

@@ -1,4 +1,4 @@
-"""A dead time and a lag for each action, where one for all of them does not explain the data."""
+"""A dead time for each action, where one for all of them does not explain the data."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from phihp_torchrl.identification.model import Model, part_of
-from phihp_torchrl.identification.trials import Trial
 from phihp_torchrl.tasks import Numbers
 
 if TYPE_CHECKING:
@@ -62,57 +61,3 @@ def delay_each(chooser: Chooser, moving: Sequence[int]) -> None:
                     chooser.best, best = trial, delays[i]
             if best != begin:
                 break
-
-
-def lag_each(chooser: Chooser, moving: Sequence[int]) -> None:
-    """A lag for each action in the place of one for all; else one for single actions.
-
-    Args:
-        chooser: what tries models; its best one is the first guess.
-        moving: the actions whose commands change.
-    """
-    if "lag" in chooser.best.model.fitted:
-        _part_lag(chooser, moving)
-        return
-    names = chooser.best.model.actions
-    for i in moving:
-        base, delays = chooser.best, each(chooser.delay(), len(names))
-        had, shorter = delays[i], {0.0, float(int(delays[i]) // 2), float(round(delays[i]))}
-        for dead in sorted(shorter) if chooser.config.delay == "auto" else [had]:
-            delays[i] = dead
-            model = replace(base.model, path=replace(base.model.path, delay_steps=tuple(delays)))
-            start = max(had - dead, 0.5) * chooser.trials.samples.step
-            label = f"delay {dead:g}, lag of {names[i]}" if dead else f"lag of {names[i]}"
-            trial = chooser.consider(label, model.with_part("lag", start, i))
-            instead = chooser.best is base and not dead and had > 0  # one number for another
-            if chooser.lower(trial) if instead else chooser.trials.better(trial, chooser.best):
-                chooser.best = trial
-
-
-def _part_lag(chooser: Chooser, moving: Sequence[int]) -> None:
-    """Try a lag for each action, and then without those that do not help."""
-    best = chooser.best
-    names, path = best.model.actions, best.model.actuator(best.raw)
-    others = tuple(name for name in best.model.fitted if name != "lag")
-    lag = max(each(path.lag, len(names)))
-    model = replace(best.model, fitted=others, path=replace(path, lag=0.0))
-    for i in moving:
-        model = model.with_part("lag", lag, i)
-    parted = chooser.consider("a lag of each action", model)
-    if not chooser.trials.better(parted, best):
-        return
-    chooser.best = parted
-    for i in moving:
-        rich = chooser.best
-        trial = chooser.consider(f"no lag of {names[i]}", _without_lag(rich, i))
-        if not chooser.trials.better(rich, trial):
-            chooser.best = trial
-
-
-def _without_lag(trial: Trial, i: int) -> Model:
-    """The model of a trial, with its numbers as first guesses, and no lag of one action."""
-    model, path = trial.model, trial.model.actuator(trial.raw)
-    lags = each(path.lag, len(model.actions))
-    lags[i] = 0.0
-    kept = tuple(n for n in model.fitted if part_of(n) != ("lag", model.actions[i]))
-    return replace(model, fitted=kept, path=replace(path, lag=tuple(lags)))

@@ -1,4 +1,4 @@
-"""Dead times and lags that differ from action to action."""
+"""Dead times that differ from action to action."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ONLY = {
     "integrator": "rk4",
     "substeps": 1,
 }
-"""Delays and lags alone are looked for."""
+"""Delays alone are looked for."""
 
 
 class Pushed(System):
@@ -70,20 +70,3 @@ def test_each_action_has_the_delay_that_it_has(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_one_delay_stays_one_number() -> None:
     assert found_behind(Actuator(2.0), lag=0.0).actuator.delay_steps == 2.0
-
-
-@pytest.mark.slow
-def test_each_action_has_the_lag_that_it_has() -> None:
-    found = found_behind(Actuator((1.0, 0.0), lag=(0.0, 0.08)), samples=2000)
-    assert found.actuator.delay_steps == (1.0, 0.0)
-    none, lag = found.actuator.lag_s
-    low, high = found.actuator.intervals["lag_s of right"]
-    assert none == 0.0
-    assert low < 0.08 < high < 1.2 * lag
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_no_action_has_a_drive_where_there_is_none(seed: int) -> None:
-    log = record(Pushed(), TRUE, noise=(3e-3, math.nan), samples=1000, seed=seed)
-    assert identify(make_task(Pushed()), [log]).actuator.actuator is None
