@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 
 from phihp_torchrl.identification.config import AUTO, IdentifyConfig
-from phihp_torchrl.identification.model import Model
+from phihp_torchrl.identification.each_action import delay_each, in_words, with_delays
+from phihp_torchrl.identification.model import Model, part_of
 from phihp_torchrl.identification.parts import ActuatorTrial
 from phihp_torchrl.identification.trials import Trial, Trials
 from phihp_torchrl.integrators import make_integrator
-from phihp_torchrl.tasks import Actuator
+from phihp_torchrl.tasks import Actuator, Numbers
 
 _WHOLE = 0.1
 """A delay this near to a whole number of steps is taken to be one."""
@@ -45,14 +47,20 @@ class Chooser:
         self.tried = [self.best]
 
     def choose_all(self) -> None:
-        """Delay, lag, the other parts, and the integrator, in this order."""
+        """Delay, lag, the other parts, and the integrator, in this order.
+
+        Where several actions move, each may have its own delay.
+        """
         self.choose_delay()
+        moving = self._moving()
+        if len(moving) > 1 and self.config.delay == AUTO:
+            delay_each(self, moving)
         self.choose_lag()
         self.choose_slew()
         self.choose_parts()
         self.choose_integrator()
 
-    def _consider(self, part: str, model: Model) -> Trial:
+    def consider(self, part: str, model: Model) -> Trial:
         """Try a model that starts from the constants of the best one."""
         raw = model.first()
         raw[: model.constants] = self.best.raw[: model.constants]
@@ -65,14 +73,14 @@ class Chooser:
         if self.config.delay != AUTO or not self._moves():
             return
         for delay in range(1, self.config.largest_delay + 1):
-            model = self._with_delay(float(delay))
-            trial = self._consider(f"delay {delay}", model)
+            model = with_delays(self.best.model, float(delay))
+            trial = self.consider(f"delay {delay}", model)
             if self.trials.better(trial, self.best):
                 self.best = trial
-            elif delay > self._delay() + 1:
+            elif delay > self._longest() + 1:
                 break
-        start = abs(self._delay() - 0.5)
-        trial = self._consider(
+        start = abs(self._longest() - 0.5)
+        trial = self.consider(
             "delay with a fraction", self.best.model.with_part("delay_steps", start)
         )
         found = trial.raw[-1].item()
@@ -83,33 +91,28 @@ class Chooser:
         """A lag, with the delay that was found and with shorter ones, which it may explain."""
         if self.config.lag != AUTO or not self._moves():
             return
-        base, delay = self.best, self._delay()
-        shorter = {0.0, float(int(delay) // 2), float(round(delay))}
-        for dead in sorted(shorter) if self.config.delay == AUTO else [delay]:
-            start = max(delay - dead, 0.5) * self.trials.samples.step
-            model = self._with_delay(dead).with_part("lag", start)
-            trial = self._consider(f"delay {dead:g}, lag" if dead else "lag", model)
-            instead = self.best is base and not dead and delay > 0  # one number for another
-            if self._lower(trial) if instead else self.trials.better(trial, self.best):
+        base, delay = self.best, self.delay()
+        shorter: list[Numbers] = [0.0, _changed(delay, lambda d: d // 2), _changed(delay, round)]
+        shorter = [d for i, d in enumerate(shorter) if d not in shorter[:i]]
+        for dead in shorter if self.config.delay == AUTO else [delay]:
+            start = max(_longest(delay) - _longest(dead), 0.5) * self.trials.samples.step
+            model = with_delays(self.best.model, dead).with_part("lag", start)
+            late = _longest(dead) > 0
+            trial = self.consider(f"delay {in_words(dead)}, lag" if late else "lag", model)
+            instead = self.best is base and not late and _longest(delay) > 0  # one for another
+            if self.lower(trial) if instead else self.trials.better(trial, self.best):
                 self.best = trial
-
-    def _with_delay(self, delay: float) -> Model:
-        """The best model with another delay, which is not fitted."""
-        model = self.best.model
-        fitted = tuple(part for part in model.fitted if part not in ("delay_steps", "lag"))
-        free = {"delay_steps": delay, **({"lag": 0.0} if "lag" in model.fitted else {})}
-        return replace(model, fitted=fitted, path=replace(model.path, **free))
 
     def choose_slew(self) -> None:
         """A limit of the rate, behind the delay, or instead of a lag that stands for it."""
         rate = self._rate()
         if self.config.slew != AUTO or not rate:
             return
-        lagging = "lag" in self.best.model.fitted
+        lagging = any(part_of(name)[0] == "lag" for name in self.best.model.fitted)
         for share in (0.3, 0.05):
-            model = self._with_delay(0.0 if lagging else self._delay())
-            trial = self._consider("slew", model.with_part("slew", share * rate))
-            if self._lower(trial) if lagging else self.trials.better(trial, self.best):
+            model = with_delays(self.best.model, 0.0 if lagging else self.delay())
+            trial = self.consider("slew", model.with_part("slew", share * rate))
+            if self.lower(trial) if lagging else self.trials.better(trial, self.best):
                 self.best, lagging = trial, False
 
     def choose_parts(self) -> None:
@@ -122,7 +125,7 @@ class Chooser:
             if getattr(self.config, part) != AUTO or not possible or not self._moves():
                 continue
             model = self.settled().with_part(part, start)
-            trial = self._consider(f"{self.best.part}, {part}", model)
+            trial = self.consider(f"{self.best.part}, {part}", model)
             if self.trials.better(trial, self.best):
                 self.best = trial
 
@@ -162,23 +165,42 @@ class Chooser:
         rows = []
         for trial in self.tried:
             path = trial.model.actuator(trial.raw)
-            values = {name: float(value) for name, value in path.config.items()}
             cost = self.trials.cost(trial, self.best)
-            rows.append(ActuatorTrial(trial.part, values, cost, trial is self.best))
+            rows.append(ActuatorTrial(trial.part, path.config, cost, trial is self.best))
         return tuple(rows)
 
-    def _delay(self) -> float:
-        return float(self.best.model.actuator(self.best.raw).delay_steps)  # type: ignore[arg-type]
+    def delay(self) -> Numbers:
+        """The delay of the best model, for all actions or for each."""
+        return self.best.model.actuator(self.best.raw).delay_steps
 
-    def _lower(self, trial: Trial) -> bool:
+    def _longest(self) -> float:
+        return _longest(self.delay())
+
+    def lower(self, trial: Trial) -> bool:
+        """Whether a trial costs less than the best one, however little."""
         return self.trials.cost(trial, self.best) < self.trials.cost(self.best, self.best)
 
     def _moves(self) -> bool:
         """Whether any command ever changes."""
-        return bool((self.trials.samples.action.std(0) > 0).any())
+        return bool(self._moving())
+
+    def _moving(self) -> list[int]:
+        """The actions whose commands change."""
+        return (self.trials.samples.action.std(0) > 0).nonzero().flatten().tolist()
 
     def _rate(self) -> float:
         samples = self.trials.samples
         rates = (samples.action.diff(dim=0).abs() / samples.interval[:-1, None]).flatten()
         moving = rates[rates > 0]
         return float(torch.quantile(moving, 0.9)) if len(moving) else 0.0
+
+
+def _longest(delay: Numbers) -> float:
+    return max(delay) if isinstance(delay, tuple) else delay
+
+
+def _changed(delay: Numbers, change: Callable[[float], float]) -> Numbers:
+    """The delay, or that of each action, changed."""
+    if isinstance(delay, tuple):
+        return tuple(float(change(d)) for d in delay)
+    return float(change(delay))

@@ -12,10 +12,10 @@ from phihp_torchrl.dynamics import PhysicsPrior
 from phihp_torchrl.identification.response import respond
 from phihp_torchrl.identification.windows import Samples
 from phihp_torchrl.integrators import Integrator, StateLayout
-from phihp_torchrl.tasks import Actuator
+from phihp_torchrl.tasks import Actuator, Numbers
 
 PARTS = ("delay_steps", "lag", "slew", "dead_zone", "gain_low")
-"""Parts of an actuator that can be fitted, each a number for all actions."""
+"""Parts of an actuator that can be fitted, each a number for all actions, or for one of them."""
 
 _NUDGE = 1e-5
 """Relative size of the differences by which derivatives are taken, in double precision."""
@@ -30,7 +30,8 @@ class Model:
         layout: positions and velocities of the state, and limits of the velocities.
         integrator: a Runge-Kutta or Euler step with substeps.
         path: the actuator; its fitted parts are overwritten.
-        fitted: names of the parts that are fitted.
+        fitted: names of the parts that are fitted: ``"lag"`` for all actions, or
+            ``"lag of volts"`` for one.
     """
 
     prior: PhysicsPrior
@@ -44,15 +45,45 @@ class Model:
         """How many parameters are those of constants."""
         return len(self.prior.learned)
 
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Names of the actions."""
+        return self.prior.system.action_names
+
     def first(self) -> Tensor:
         """Parameters of the first guesses."""
-        parts = [_to_raw(name, getattr(self.path, name)) for name in self.fitted]
+        parts = [_to_raw(part_of(n)[0], self.number(self.path, n)) for n in self.fitted]
         raw = self.prior.log_constants.detach().double()
         return torch.cat([raw, torch.tensor(parts, dtype=raw.dtype)])
 
-    def with_part(self, name: str, value: float) -> Model:
-        """The same equations, with one more part of the actuator fitted, from a first guess."""
-        return replace(self, fitted=(*self.fitted, name), path=replace(self.path, **{name: value}))
+    def with_part(self, name: str, value: float, action: int | None = None) -> Model:
+        """The same equations, with one more part of the actuator fitted, from a first guess.
+
+        Args:
+            name: the part.
+            value: its first guess.
+            action: the action that it is of; ``None`` for all.
+        """
+        if action is not None:
+            name = f"{name} of {self.actions[action]}"
+        return replace(self, fitted=(*self.fitted, name), path=self._put(self.path, name, value))
+
+    def number(self, path: Actuator, name: str) -> float:
+        """The number of a fitted part."""
+        part, action = part_of(name)
+        value: Numbers = getattr(path, part)
+        if not isinstance(value, tuple):
+            return value
+        return value[0 if action is None else self.actions.index(action)]
+
+    def _put(self, path: Actuator, name: str, value: float) -> Actuator:
+        part, action = part_of(name)
+        if action is None:
+            return replace(path, **{part: value})
+        old = getattr(path, part)
+        values = list(old) if isinstance(old, tuple) else [old] * len(self.actions)
+        values[self.actions.index(action)] = value
+        return replace(path, **{part: tuple(values)})
 
     def stopping(self, layout: StateLayout, raw: Tensor) -> Model:
         """The same equations in a layout with stops, for constants that stay as they are."""
@@ -68,8 +99,10 @@ class Model:
     def actuator(self, raw: Tensor) -> Actuator:
         """The actuator that belongs to parameters ``[p]``."""
         values = raw[self.constants :].tolist()
-        pairs = zip(self.fitted, values, strict=True)
-        return replace(self.path, **{name: _from_raw(name, value) for name, value in pairs})
+        path = self.path
+        for name, value in zip(self.fitted, values, strict=True):
+            path = self._put(path, name, _from_raw(part_of(name)[0], value))
+        return path
 
     def acting(self, samples: Samples, raw: Tensor) -> Tensor:
         """What acts after each sample, ``[N, m]``."""
@@ -143,6 +176,17 @@ class Model:
         high, low = ahead.chunk(2)
         slopes = ((high - low) / (2.0 * size[:tried, None, None])).permute(1, 2, 0)
         return slopes[..., :n], slopes[..., n : n + m], slopes[..., n + m :]
+
+
+def part_of(name: str) -> tuple[str, str | None]:
+    """The part of an actuator that is fitted, and the action that it is of; ``None`` for all.
+
+    Examples:
+        >>> part_of("lag"), part_of("lag of volts")
+        (('lag', None), ('lag', 'volts'))
+    """
+    part, _, action = name.partition(" of ")
+    return part, action or None
 
 
 def _to_raw(name: str, value: float) -> float:

@@ -119,8 +119,10 @@ def _tiles(found: Identification) -> str:
         good = sum(c.verdict == IDENTIFIED for c in found.combinations.values())
         tiles.append((f"{good} of {len(found.combinations)}", "combinations are identified"))
     a = found.actuator
-    path = [f"delay {sections.number(a.delay_steps)} steps"] if a.delay_steps else []
-    path += [f"lag {sections.number(a.lag_s)} s"] if a.lag_s else []
+    path = [f"{n.replace('_steps', '')} {sections.number(v)} steps"
+            for n, v in a.rows("delay_steps").items() if v]  # fmt: skip
+    path += [f"{n.replace('_s', '')} {sections.number(v)} s"
+             for n, v in a.rows("lag_s").items() if v]  # fmt: skip
     rest = [a.slew is not None and "rate limit", a.dead_zone and "dead zone",
             a.gain_low != 1.0 and "unequal gains"]  # fmt: skip
     path += [str(part) for part in rest if part]

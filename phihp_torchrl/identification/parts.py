@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from phihp_torchrl.systems import Constant
-from phihp_torchrl.tasks import Actuator
+from phihp_torchrl.tasks import Actuator, Numbers
 
 IDENTIFIED = "identified"
 IF_COMPLETE = "identified only if the equations are complete"
@@ -51,35 +51,45 @@ class ActuatorTrial:
     """
 
     part: str
-    values: Mapping[str, float]
+    values: Mapping[str, Numbers]
     cost: float
     kept: bool = False
 
 
 @dataclass(frozen=True)
 class ActuatorEstimate:
-    """What happens to a command before it acts, the same for all actions.
+    """What happens to a command before it acts.
 
     A part that the data did not ask for has its neutral number: no delay, no lag, no limit of the
     rate, no dead zone, a gain of one.
 
     Args:
-        delay_steps: dead time in steps of the data (their median).
-        lag_s: time constant in seconds.
+        delay_steps: dead time in steps of the data (their median), for all actions or for each.
+        lag_s: time constant in seconds, for all actions or for each.
         slew: largest rate in units of the action per second; ``None`` for no limit.
         dead_zone: size of commands that have no effect.
         gain_low: gain of negative commands.
-        intervals: 95 % intervals of the fitted parts, by name.
+        intervals: 95 % intervals of the fitted parts, by name, such as ``"lag_s"``, or
+            ``"lag_s of volts"`` for one action.
         tried: every path that was tried, in order.
+        actions: names of the actions.
     """
 
-    delay_steps: float = 0.0
-    lag_s: float = 0.0
+    delay_steps: Numbers = 0.0
+    lag_s: Numbers = 0.0
     slew: float | None = None
     dead_zone: float = 0.0
     gain_low: float = 1.0
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     tried: tuple[ActuatorTrial, ...] = ()
+    actions: tuple[str, ...] = ()
+
+    def rows(self, part: str) -> dict[str, float | None]:
+        """The numbers of a part by their names in :attr:`intervals`."""
+        value = getattr(self, part)
+        if not isinstance(value, (tuple, list)):
+            return {part: value}
+        return {f"{part} of {n}": v for n, v in zip(self.actions, value, strict=True)}
 
     @property
     def actuator(self) -> Actuator | None:

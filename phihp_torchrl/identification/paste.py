@@ -10,6 +10,9 @@ from phihp_torchrl.identification.result import Identification
 from phihp_torchrl.systems import Constant
 from phihp_torchrl.tasks import Task
 
+_LIST = str.maketrans("()", "[]")
+"""A tuple as a list in YAML."""
+
 
 def ready_to_paste(task: Task, found: Identification) -> dict[str, str]:
     """Code with the fitted constants and the fitted actuator, by where it belongs.
@@ -42,7 +45,7 @@ def ready_to_paste(task: Task, found: Identification) -> dict[str, str]:
     if actuator is not None:
         numbers = {name: _rounded(value) for name, value in actuator.config.items()}
         python = ", ".join(f"{name}={value}" for name, value in numbers.items())
-        yaml = ", ".join(f"{name}: {value}" for name, value in numbers.items())
+        yaml = ", ".join(f"{n}: {v.translate(_LIST)}" for n, v in numbers.items())
         given.append(f"actuator=Actuator({python}),")
         lines[f"the actuator in the settings of {task.name}, in YAML"] = f"actuator: {{{yaml}}}"
     if new := {
@@ -78,4 +81,6 @@ def _rounded(value: object) -> str:
     """Six digits, which is more than any log tells."""
     if isinstance(value, float) and not math.isfinite(value):
         return f'float("{value}")'
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_rounded, value))})"
     return repr(float(f"{value:.6g}")) if isinstance(value, float) else repr(value)

@@ -146,7 +146,12 @@ class Identification:
         actuator, step = self.actuator.actuator, self.data.get("step_s")
         if actuator is None or not step or abs(step / task.time_step - 1.0) < 0.02:
             return actuator
-        return replace(actuator, delay_steps=self.actuator.delay_steps * step / task.time_step)
+        delay, scale = actuator.delay_steps, step / task.time_step
+        # A hair above a whole number of steps would be a register more.
+        scaled = [round(scale * d, 6) for d in (delay if isinstance(delay, tuple) else (delay,))]
+        return replace(
+            actuator, delay_steps=tuple(scaled) if isinstance(delay, tuple) else scaled[0]
+        )
 
     def table(self) -> str:
         """A page for a console."""

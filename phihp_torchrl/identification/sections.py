@@ -20,6 +20,7 @@ from phihp_torchrl.identification.parts import (
 )
 from phihp_torchrl.identification.result import Identification
 from phihp_torchrl.identification.svg import interval_bar
+from phihp_torchrl.tasks import Numbers
 
 _LARGE = 2.0
 """Multiple of the noise from which on an error is marked."""
@@ -151,15 +152,21 @@ def actuator_parts(found: Identification) -> str:
     a, step = found.actuator, found.data.get("step_s")
     rows = []
     for key, (label, unit, neutral) in PARTS.items():
-        value, ends = getattr(a, key), a.intervals.get(key)
-        words = "none" if value == neutral else f"{number(value)} {unit}"
-        if key == "delay_steps" and value and step:
-            words += f" ({number(value * step)} s)"
-        if key == "gain_low" and value == neutral:
-            words = "1, as of positive ones"
-        interval = _interval(*ends) if ends else ""
-        rows.append([Cell(label, head=True), Cell(words), Cell(interval)])
+        for name, value in a.rows(key).items():
+            ends = a.intervals.get(name)
+            words = "none" if value == neutral else f"{number(value)} {unit}"
+            if key == "delay_steps" and value and step:
+                words += f" ({number(value * step)} s)"
+            if key == "gain_low" and value == neutral:
+                words = "1, as of positive ones"
+            interval = _interval(*ends) if ends else ""
+            head = escape(label + name.removeprefix(key))
+            rows.append([Cell(head, head=True), Cell(words), Cell(interval)])
     return table(("part", "estimate", "95 % interval"), rows, "Parts of the actuator")
+
+
+def _numbers(value: Numbers) -> str:
+    return " and ".join(number(v) for v in (value if isinstance(value, tuple) else (value,)))
 
 
 def tried_paths(found: Identification) -> str:
@@ -167,7 +174,7 @@ def tried_paths(found: Identification) -> str:
     rows = [
         [
             Cell(escape(trial.part), head=True),
-            Cell(escape(", ".join(f"{k} {number(v)}" for k, v in trial.values.items()))),
+            Cell(escape(", ".join(f"{k} {_numbers(v)}" for k, v in trial.values.items()))),
             Cell(number(trial.cost), "number"),
             Cell("kept", "kept") if trial.kept else Cell(""),
         ]

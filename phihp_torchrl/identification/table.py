@@ -26,10 +26,14 @@ def _actuator(actuator: Mapping[str, Any]) -> str:
     neutral = {"delay_steps": 0.0, "lag_s": 0.0, "slew": None, "dead_zone": 0.0, "gain_low": 1.0}
     rows = [("actuator", "estimate", "95 % interval")]
     for name, value in neutral.items():
-        if actuator[name] != value:
-            ends = actuator["intervals"].get(name)
-            interval = f"{_n(ends[0])} to {_n(ends[1])}" if ends else "–"
-            rows.append((name, _n(actuator[name]), interval))
+        given, numbers = actuator[name], {name: actuator[name]}
+        if isinstance(given, list):
+            numbers = {f"{name} of {a}": v for a, v in zip(actuator["actions"], given, strict=True)}
+        for label, number in numbers.items():
+            if given != value:
+                ends = actuator["intervals"].get(label)
+                interval = f"{_n(ends[0])} to {_n(ends[1])}" if ends else "–"
+                rows.append((label, _n(number), interval))
     if len(rows) == 1:
         return "actuator: commands act as they are, and at once"
     return _columns(rows)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.identification.covariance import SHARE, Uncertainty, monomials
-from phihp_torchrl.identification.model import Model
+from phihp_torchrl.identification.model import Model, part_of
 from phihp_torchrl.identification.parts import (
     AT_LIMIT,
     COMBINED,
@@ -21,6 +21,7 @@ from phihp_torchrl.identification.parts import (
     Estimate,
 )
 from phihp_torchrl.systems import Constant, System
+from phihp_torchrl.tasks import Numbers
 
 _NEAR = 0.01
 """Share of its range, or of its first guess, at which a constant counts as at its limit."""
@@ -39,7 +40,7 @@ def scale_of(model: Model, raw: Tensor) -> Tensor:
             around_zero = c.low < 0 < c.high
             scale[i] = slope / (c.high - c.low if around_zero else value.abs().clamp_min(1e-12))
     for i, part in enumerate(model.fitted, start=model.constants):
-        if part == "delay_steps":
+        if part_of(part)[0] == "delay_steps":
             scale[i] = 1.0 / raw[i].abs().clamp_min(1.0)
     return scale
 
@@ -187,19 +188,25 @@ def judge_actuator(
         unit[i] = 1.0
         shift = unit * doubt.reach(unit) / doubt.scale
         if not doubt.touches(unit):
-            low, high = (getattr(model.actuator(raw + sign * shift), part) for sign in (-1, 1))
-            intervals["lag_s" if part == "lag" else part] = (low, high)
+            low, high = (model.number(model.actuator(raw + sign * shift), part) for sign in (-1, 1))
+            intervals[part.replace("lag", "lag_s", 1) if part[:3] == "lag" else part] = (low, high)
     return ActuatorEstimate(
-        delay_steps=_one(path.delay_steps),
-        lag_s=_one(path.lag),
+        delay_steps=_same(path.delay_steps),
+        lag_s=_same(path.lag),
         slew=None if path.slew is None else _one(path.slew),
         dead_zone=_one(path.dead_zone),
         gain_low=_one(path.gain_low),
         intervals=intervals,
         tried=tried,
+        actions=model.actions,
     )
 
 
-def _one(value: float | tuple[float, ...]) -> float:
+def _same(value: Numbers) -> Numbers:
+    """One number where that of every action is the same."""
+    return value[0] if isinstance(value, tuple) and len(set(value)) == 1 else value
+
+
+def _one(value: Numbers) -> float:
     """The number of all actions."""
     return value[0] if isinstance(value, tuple) else value

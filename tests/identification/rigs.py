@@ -65,7 +65,8 @@ MASS = {"gain": 1.3, "stiffness": 6.0, "damping": 0.5}
 
 def make_task(system: System, high: float = 5.0, step: float = 0.02) -> Task:
     box = Box((0.0,) * system.state_dim, (0.1,) * system.state_dim)
-    return Task("rig", system, (high,), step, 500, box, lambda s, a, n: -s[..., 0].square())
+    highs = (high,) * system.action_dim
+    return Task("rig", system, highs, step, 500, box, lambda s, a, n: -s[..., 0].square())
 
 
 def record(
@@ -85,12 +86,14 @@ def record(
 ) -> Recording:
     """Simulate steps of a random command that is held; a stop leaves a share of its speed."""
     generator = torch.Generator().manual_seed(seed)
-    draw = torch.rand(samples // hold + 1, 1, generator=generator, dtype=torch.float64)
+    draw = torch.rand(
+        samples // hold + 1, system.action_dim, generator=generator, dtype=torch.float64
+    )
     command = (high * (2.0 * draw - 1.0)).repeat_interleave(hold, 0)[:samples]
     spread = torch.rand(samples, generator=generator, dtype=torch.float64) - 0.5
     seconds = step * (1.0 + jitter * spread)
     truth = system.with_constants(constants)
-    registers = actuator.rest(torch.zeros(1, dtype=torch.float64)) if actuator else None
+    registers = actuator.rest(torch.zeros_like(command[0])) if actuator else None
     state, states, layout = torch.tensor([0.3, 0.0]).double(), [], system.layout()
     solver = make_integrator("rk4")
     for i in range(samples):
