@@ -41,6 +41,7 @@ def test_a_run_is_told_its_budget_and_what_is_known_of_the_simulator_alone(name)
         assert int(steps) * WORLDS[entry.world].repeat == entry.environment_steps
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_read_and_not_repeated(tmp_path):
     path = tmp_path / "run"
     found = worlds.train("pendulum-v1", 3, path, SHORT)
@@ -63,7 +64,11 @@ def finished(task, seed, planner):
         "policy": {},
         "metrics": {"policy/best_imagined_return": 812.5},
         "seconds": {"model": 3.0},
-        "origin": {"commit": "a" * 40, "machine": {"cpus": 2, "memory_gib": 24.0, "gpus": 0}},
+        "origin": {
+            "commit": "a" * 40,
+            "dirty": False,
+            "machine": {"cpus": 2, "memory_gib": 24.0, "gpus": 0},
+        },
     }
 
 
