@@ -5,10 +5,10 @@
 Needs the extra ``dmcontrol``. A run has the default settings; it is told the system, its stops and
 the simulator's integrator, as in ``other_worlds``, and takes at most as many steps of the
 environment as ``ENTRIES`` says. It is judged in the world itself, in episodes that no training
-uses. Writes results/worlds/<task>-<seed>.json after every run, and a README.md and a picture beside
-them. A run that was stopped goes on from its last checkpoint when the command is given again, and
-one that is finished is not repeated. The scores of others are those of results/worlds/published.csv,
-which ``published_scores.py`` makes.
+uses. Writes results/worlds/<task>-<seed>.json after every run, and a README.md and a picture
+beside them. A run that was stopped goes on from its last checkpoint when the command is given
+again, and one that is finished is not repeated. The scores of others are those of
+results/worlds/published.csv, which ``published_scores.py`` makes.
 """
 
 from __future__ import annotations
