@@ -22,6 +22,8 @@ from phihp_torchrl.tasks.actuator import Actuator
 from phihp_torchrl.tasks.actuator_part import ActuatorPart
 from phihp_torchrl.tasks.bounds import ActionBounds, read_limits
 from phihp_torchrl.tasks.box import Box
+from phihp_torchrl.tasks.constraint import Constraint
+from phihp_torchrl.tasks.constraints import Constraints
 from phihp_torchrl.tasks.disturbance import Disturbance, DisturbancePart
 from phihp_torchrl.tasks.last_action import LastAction
 from phihp_torchrl.tasks.numbers import Numbers, check_each, read_numbers
@@ -106,6 +108,8 @@ class Task:
         inputs: what acts on the system without being commanded, and is measured, such as wind. Its
             components are the system's :attr:`~phihp_torchrl.System.input_names`.
         disturbance: an unmeasured drift that lasts, which an agent estimates while it acts.
+        constraints: limits of states, or of functions of state and action: soft ones at a price,
+            hard ones that end the episode. Evaluations report their violations.
 
     Raises:
         ConfigError: for a field whose length or range does not fit the system; the message names
@@ -143,6 +147,7 @@ class Task:
     reference: Signal | None = None
     inputs: Signal | None = None
     disturbance: Disturbance | None = None
+    constraints: tuple[Constraint, ...] = ()
 
     layout: StateLayout = field(init=False, repr=False, compare=False)
     """Positions, velocities and their limits, for integrators."""
@@ -150,6 +155,8 @@ class Task:
     """What the task adds to the physical state."""
     outside: Outside = field(init=False, repr=False, compare=False)
     """The reference and the inputs, which are the first of the registers."""
+    limits: Constraints = field(init=False, repr=False, compare=False)
+    """The constraints, as functions of tensors."""
     _reads: dict[str, tuple[str, ...]] = field(
         init=False, repr=False, compare=False, default_factory=dict
     )
@@ -178,6 +185,8 @@ class Task:
         object.__setattr__(self, "position_limits", dict(self.position_limits))
         layout = self.system.layout(self.velocity_limits, self.position_limits, self.restitution)
         object.__setattr__(self, "layout", layout)
+        object.__setattr__(self, "limits", Constraints(self.constraints, self.system, self.reset))
+        object.__setattr__(self, "constraints", self.limits.each)
         self._check_outside()
         parts = self.parts()
         object.__setattr__(self, "registers", Registers(parts))
@@ -399,9 +408,9 @@ class Task:
                 moved = moved + self.time_step * drift
             next_state = torch.cat([moved, after], -1)
         reward = self.earned(state, action, next_state)
-        if (price := self.registers.price(registers, action)) is not None:
+        if (price := self._price(registers, action, moved)) is not None:
             reward = reward - price
-        return Transition(next_state, reward, self.is_terminated(next_state))
+        return Transition(next_state, reward, self.is_terminated(next_state, action))
 
     def earned(self, state: Tensor, command: Tensor, next_state: Tensor) -> Tensor:
         """The reward of a step without prices, ``[*batch]``.
@@ -421,7 +430,9 @@ class Task:
         values = self.outside.values(registers)
         return {key: values[key] for key in keys}
 
-    def price(self, state: Tensor, action: Tensor) -> Tensor | None:
+    def price(
+        self, state: Tensor, action: Tensor, next_state: Tensor | None = None
+    ) -> Tensor | None:
         """What a step costs where the task is imagined, ``[*batch]``; ``None`` for nothing.
 
         A world gives rewards without prices, so whoever learns from its steps subtracts them.
@@ -429,22 +440,43 @@ class Task:
         Args:
             state: the state before the step, ``[*batch, n]``.
             action: the action of the step, ``[*batch, m]``.
+            next_state: the state after it, ``[*batch, n]``, which constraints are judged by.
+
+        Raises:
+            ConfigError: without a ``next_state`` where the task has constraints.
         """
         _, registers = self.split(state)
-        return self.registers.price(registers, self.command(registers, action))
+        moved = None if next_state is None else self.split(next_state)[0]
+        return self._price(registers, self.command(registers, action), moved)
+
+    def _price(self, registers: Tensor, command: Tensor, moved: Tensor | None) -> Tensor | None:
+        if self.limits and moved is None:
+            raise ConfigError("next_state", "expected one, for the task has constraints.")
+        price = self.registers.price(registers, command)
+        more = None if moved is None else self.limits.price(moved, command)
+        return price if more is None else more if price is None else price + more
 
     def unpriced(self) -> Task:
         """Return the task as a world plays it: with the same state, and rewards without prices."""
-        return replace(self, action_rate_cost=0.0) if self.action_rate_cost else self
+        free = {"action_rate_cost": 0.0} if self.action_rate_cost else {}
+        if any(constraint.price for constraint in self.constraints):
+            return replace(self, constraints=self.limits.unpriced(), **free)
+        return replace(self, **free) if free else self
 
     def clip_action(self, action: Tensor) -> Tensor:
         """Clip an action ``[*batch, m]`` to its bounds."""
         limits = zip(action.unbind(-1), self.action_low or (), self.action_high, strict=True)
         return torch.stack([a.clamp(low, high) for a, low, high in limits], -1)
 
-    def is_terminated(self, next_state: Tensor) -> Tensor:
-        """Whether ``next_state`` ``[*batch, n]`` ends the episode, bool ``[*batch]``."""
-        if self.terminated is None:
-            return torch.zeros(next_state.shape[:-1], dtype=torch.bool, device=next_state.device)
+    def is_terminated(self, next_state: Tensor, command: Tensor | None = None) -> Tensor:
+        """Whether ``next_state`` ``[*batch, n]`` ends the episode, bool ``[*batch]``.
+
+        The command ``[*batch, m]`` is needed where a hard constraint reads the action.
+        """
         moved, registers = self.split(next_state)
-        return self.terminated(moved, **self._signals_of("terminated", registers))
+        ended = self.limits.ended(moved, command)
+        if self.terminated is None:
+            none = torch.zeros(next_state.shape[:-1], dtype=torch.bool, device=next_state.device)
+            return none if ended is None else ended
+        own = self.terminated(moved, **self._signals_of("terminated", registers))
+        return own if ended is None else own | ended

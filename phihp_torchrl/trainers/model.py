@@ -161,8 +161,10 @@ class ModelTrainer:
         next_state = self.task.locate(self.data["next", "observation"])
         action = self.data["action"]
         # "done" in the data includes truncations, which are not terminations.
-        terminated = self.task.is_terminated(next_state)
-        reward, price = self.data["next", "reward"][:, 0], self.task.price(state, action)
+        command = self.task.command(self.task.split(state)[1], action)
+        terminated = self.task.is_terminated(next_state, command)
+        reward = self.data["next", "reward"][:, 0]
+        price = self.task.price(state, action, next_state)
         reward = reward if price is None else reward - price
         return Batch(state, action, reward, next_state, terminated)
 
