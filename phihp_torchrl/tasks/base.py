@@ -458,10 +458,11 @@ class Task:
 
     def unpriced(self) -> Task:
         """Return the task as a world plays it: with the same state, and rewards without prices."""
-        free = {"action_rate_cost": 0.0} if self.action_rate_cost else {}
-        if any(constraint.price for constraint in self.constraints):
-            return replace(self, constraints=self.limits.unpriced(), **free)
-        return replace(self, **free) if free else self
+        constraints = self.limits.unpriced()
+        if not self.action_rate_cost and constraints == self.constraints:
+            return self
+        cost = None if self.action_rate_cost is None else 0.0
+        return replace(self, action_rate_cost=cost, constraints=constraints)
 
     def clip_action(self, action: Tensor) -> Tensor:
         """Clip an action ``[*batch, m]`` to its bounds."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from phihp_torchrl.config import ConfigError
@@ -41,7 +42,6 @@ class Constraint:
             a price.
 
     Examples:
-        >>> import torch
         >>> near = Constraint("x", low=-1.0, high=1.0, price=5.0)
         >>> near.violation(torch.tensor([0.5, 1.25, -3.0]))
         tensor([0.0000, 0.2500, 2.0000])
@@ -95,7 +95,9 @@ class Constraint:
 
     def violation(self, value: Tensor) -> Tensor:
         """How far values ``[*batch]`` are beyond a limit, in their units; 0 within them."""
-        if self.low is None:
-            return (value - self.high).clamp_min(0.0)
-        below = (self.low - value).clamp_min(0.0)
-        return below if self.high is None else below + (value - self.high).clamp_min(0.0)
+        found = torch.zeros_like(value)
+        if self.low is not None:
+            found = (self.low - value).clamp_min(0.0)
+        if self.high is not None:
+            found = found + (value - self.high).clamp_min(0.0)
+        return found
