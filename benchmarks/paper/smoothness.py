@@ -109,7 +109,7 @@ def main(words: Sequence[str] | None = None) -> None:
         measured = {}
         for name, each in controllers(agent).items():
             measured[name] = measure(each, arguments.episodes)
-            print(f"{task}, {name}: {measured[name]['return_mean']:.1f}", flush=True)  # noqa: T201
+            print(f"{task}, {name}: {measured[name]['return_mean']:.1f}", flush=True)
         write(
             {
                 "task": task,

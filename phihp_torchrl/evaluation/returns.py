@@ -146,8 +146,7 @@ def evaluate(
             rounds = math.ceil(episodes / env.batch_size.numel())
             columns = zip(*(_play_env(policy, env, task) for _ in range(rounds)), strict=True)
             played = tuple(torch.cat(column)[:episodes] for column in columns)
-    *columns, steps, largest = (column.cpu() for column in played)
-    returns, lengths, terminated, chatter = columns
+    returns, lengths, terminated, chatter, steps, largest = (column.cpu() for column in played)
     seconds = time.perf_counter() - start
     found = zip(task.limits.names, steps.unbind(-1), largest.unbind(-1), strict=True)
     violations = {name: Violations(*each) for name, *each in found} or None

@@ -3,24 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
-import pytest
-
+import smoothness
 from phihp_torchrl import Agent, HybridDynamics, get_task, save_agent
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.planners import CEMConfig
-
-SCRIPTS = Path(__file__).parents[3] / "benchmarks" / "paper"
-
-
-@pytest.fixture
-def smoothness(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    yield __import__("smoothness")
-    sys.modules.pop("smoothness", None)
 
 
 def make_agent():
@@ -31,7 +19,7 @@ def make_agent():
     return Agent(task, dynamics=dynamics, actor=Actor(task), planner_config=plan)
 
 
-def test_prices_are_the_only_difference_between_the_plans(smoothness):
+def test_prices_are_the_only_difference_between_the_plans():
     agent = make_agent()
     found = smoothness.controllers(agent)
     assert found["planner as shipped"] is agent
@@ -41,7 +29,7 @@ def test_prices_are_the_only_difference_between_the_plans(smoothness):
         assert config == replace(agent.planner_config, change_cost=price)
 
 
-def test_it_writes_what_was_played_and_names_what_was_not(smoothness, tmp_path):
+def test_it_writes_what_was_played_and_names_what_was_not(tmp_path):
     save_agent(make_agent(), tmp_path / "agents" / "cartpole")
     words = ["--tasks", "cartpole", "--episodes", "2"]
     words += ["--agents", str(tmp_path / "agents"), "--results", str(tmp_path / "out")]
