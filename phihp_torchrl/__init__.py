@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from phihp_torchrl.imagination import WorldModelEnv
     from phihp_torchrl.planners import CEMPlanner, MPPIPlanner, register_planner
     from phihp_torchrl.systems import Constant, LagrangianSystem, System
-    from phihp_torchrl.tasks import Box, Signal, Task, get_task, register_task
+    from phihp_torchrl.tasks import Box, Constraint, Signal, Task, get_task, register_task
     from phihp_torchrl.trainers import RunConfig, RunResult, register_phase, run
     from phihp_torchrl.worlds import Plant, World, make_world, register_plant, register_world
 
@@ -38,6 +38,7 @@ _HOMES = {
     "tasks": (
         "Actuator",
         "Box",
+        "Constraint",
         "Disturbance",
         "Signal",
         "Task",
@@ -57,6 +58,7 @@ __all__ = [
     "CEMPlanner",
     "ConfigError",
     "Constant",
+    "Constraint",
     "Disturbance",
     "DynamicsLoss",
     "HybridDynamics",

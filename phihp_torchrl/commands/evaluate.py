@@ -107,8 +107,9 @@ def play(config: PlayConfig) -> None:
         seed=evaluation_seed(config.seed),
         latency_actions=config.latency_actions,
     )
-    if beside:
+    if beside or shown.task.constraints:
         print(controllers_table("controller", {**results, **beside}))  # noqa: T201
+    if beside:
         results[BASELINES_KEY] = beside
     directory = Path(config.out_dir or config.agent)
     directory.mkdir(parents=True, exist_ok=True)

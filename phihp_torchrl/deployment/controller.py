@@ -245,6 +245,8 @@ class Controller:
         self._starts = False
         if (reason := self._checks.action(action, self._last)) is not None:
             return None, reason
+        if self._checks.violates(seen, action):
+            return None, "constraint"
         if self._accept is not None and not self._accept(seen.numpy(), action.numpy()):
             return None, "refused"
         return action, None

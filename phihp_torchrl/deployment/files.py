@@ -27,7 +27,7 @@ from phihp_torchrl.deployment.formats import (
 )
 from phihp_torchrl.deployment.reading import MAX_JSON_BYTES, AgentError, read_json, read_weights
 from phihp_torchrl.origin import package_version
-from phihp_torchrl.tasks import Actuator, Task, get_task
+from phihp_torchrl.tasks import Actuator, Constraint, Task, get_task
 
 AGENT_FILE = "agent.json"
 WEIGHTS_FILE = "weights.safetensors"
@@ -281,16 +281,19 @@ _RATES = ("action_rate_limit", "action_rate_cost")
 def _additions(task: Task) -> dict[str, Any]:
     """What a task adds to the state of its system, as plain values; nothing where it adds none."""
     rates = {name: value for name in _RATES if (value := getattr(task, name)) is not None}
-    return ({} if task.actuator is None else {"actuator": task.actuator.config}) | rates
+    limits = [constraint.config for constraint in task.constraints]
+    actuator = {} if task.actuator is None else {"actuator": task.actuator.config}
+    return actuator | rates | ({"constraints": limits} if limits else {})
 
 
 def _with_additions(path: Path, task: Task, content: Mapping[str, Any]) -> Task:
-    """The task with the actuator and the rates for which the agent was trained."""
+    """The task with the actuator, the rates and the constraints the agent was trained for."""
     numbers = content.get("actuator")
     try:
         actuator = None if numbers is None else from_mapping(Actuator, numbers, "actuator")
         rates = {name: content.get(name) for name in _RATES}
-        changed = replace(task, actuator=actuator, **rates)  # type: ignore[arg-type]
+        constraints = _constraints(task, content.get("constraints", []))
+        changed = replace(task, actuator=actuator, constraints=constraints, **rates)  # type: ignore[arg-type]
     except (ConfigError, TypeError, AttributeError) as error:
         raise AgentError(f"{path}: {error}") from error
     for name in ("actuator", *_RATES):
@@ -301,6 +304,26 @@ def _with_additions(path: Path, task: Task, content: Mapping[str, Any]) -> Task:
                 f"got {saved}."
             )
     return task if changed == task else changed
+
+
+def _constraints(task: Task, saved: list[dict[str, Any]]) -> tuple[Constraint, ...]:
+    """The constraints of an agent's file: those of the task, or made anew where it has none."""
+    ours = [constraint.config for constraint in task.constraints]
+    if saved == ours:
+        return task.constraints
+    if ours:
+        raise ConfigError(
+            "constraints",
+            f"task {task.name!r} is another one here: expected its constraints {ours}, "
+            f"got {saved}.",
+        )
+    if functions := [entry["name"] for entry in saved if entry.get("function")]:
+        raise ConfigError(
+            "constraints",
+            f"the agent was trained with {functions}, functions that are no part of its file: "
+            "expected them in the task; pass it as task.",
+        )
+    return tuple(Constraint(**entry) for entry in saved)
 
 
 def _read_weights(

@@ -22,6 +22,7 @@ REASONS = {
     "not_finite": "an action that is not finite",
     "bounds": "an action outside the task's bounds",
     "rate": "an action too far from the one before",
+    "constraint": "a state, or an action, outside the task's constraints",
     "refused": "an action that the caller's own check refused",
 }
 """Why another controller takes over, by the name under which it is counted."""
@@ -47,6 +48,9 @@ class Safety:
             action: one number, or one for each. ``None`` for any.
         hold_steps: steps in a row for which the last action may be held before the motor is left
             at rest.
+        constraints: whether the fallback takes over in a step whose observed state, or that state
+            with the agent's action, is outside the task's constraints, hard or soft. It should be a
+            function that leads back, for neither the actor nor the last action needs to.
 
     Raises:
         ConfigError: for a number that is not positive.
@@ -62,6 +66,7 @@ class Safety:
     max_age: float | None = None
     max_change: float | tuple[float, ...] | None = None
     hold_steps: int = 5
+    constraints: bool = False
 
     def __post_init__(self) -> None:
         given = [n for n in ("deadline", "mismatch", "max_age") if getattr(self, n) is not None]
@@ -102,6 +107,10 @@ class Checks:
             limits = read_guards(task, safety.plausible)
         except ConfigError as error:
             raise ConfigError(error.key.replace("guards", "plausible", 1), error.reason) from error
+        if safety.constraints and not task.constraints:
+            raise ConfigError(
+                "constraints", f"expected a task with constraints, {task.name!r} has none."
+            )
         names = task.system.state_names
         self._limited = [names.index(name) for name in limits]
         self._low = torch.tensor([low for low, _ in limits.values()])
@@ -144,6 +153,13 @@ class Checks:
             (action - last).abs() > self.change + _ROUNDING * scale
         )
         return "rate" if too_far is not False and too_far.any() else None
+
+    def violates(self, observation: Tensor, action: Tensor) -> bool:
+        """Whether an observation ``[o]``, or it and an action ``[m]``, violate a constraint."""
+        if not self.safety.constraints:
+            return False
+        state = self.task.system.locate(observation[: self.task.system.observation_dim])
+        return bool((self.task.limits.violations(state, self.task.clip_action(action)) > 0).any())
 
     def towards_rest(self, last: Tensor) -> Tensor:
         """The action ``[m]`` nearest to rest (zero, in bounds) that may follow the last one."""

@@ -12,10 +12,12 @@ from phihp_torchrl.evaluation.seeds import EVALUATION_SEED, check_training_seed,
 from phihp_torchrl.evaluation.show import show_episode
 from phihp_torchrl.evaluation.table import TaskResult, markdown_table, mean_and_std, returns_table
 from phihp_torchrl.evaluation.video import write_gif
+from phihp_torchrl.evaluation.violations import Violations
 
 __all__ = [
     "Episode",
     "Evaluation",
+    "Violations",
     "episode_figure",
     "evaluate",
     "evaluation_seed",

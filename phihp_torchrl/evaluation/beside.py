@@ -12,6 +12,7 @@ from phihp_torchrl.evaluation.latency import measure_latency
 from phihp_torchrl.evaluation.returns import evaluate
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
 from phihp_torchrl.evaluation.table import markdown_table
+from phihp_torchrl.evaluation.violations import is_violation
 from phihp_torchrl.worlds import World
 
 _log = logging.getLogger(__name__)
@@ -85,6 +86,9 @@ def play_baselines(
 def controllers_table(title: str, results: Mapping[str, Mapping[str, Any]]) -> str:
     """A table with a row for each controller: return, its standard error, chatter, time.
 
+    Where the task has constraints: the share of steps and of episodes that violate each, and the
+    largest violation.
+
     Args:
         title: heading of the first column.
         results: what evaluations say, by controller; columns that none has are left out.
@@ -97,6 +101,8 @@ def controllers_table(title: str, results: Mapping[str, Mapping[str, Any]]) -> s
         <BLANKLINE>
     """
     columns = {"chatter": "chatter", "ms": "latency_ms_mean"}
+    for key in dict.fromkeys(k for each in results.values() for k in each if is_violation(k)):
+        columns[key.removeprefix("violations/").replace("/", ": ").replace("_", " ")] = key
     shown = {c: k for c, k in columns.items() if any(k in each for each in results.values())}
     rows = []
     for name, result in results.items():

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -15,6 +16,7 @@ from torchrl.envs import EnvBase
 from phihp_torchrl.config import ConfigError, is_whole
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
+from phihp_torchrl.evaluation.violations import Violations
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld, World
 
@@ -32,6 +34,7 @@ class Evaluation:
         seconds: duration of the evaluation.
         chatter: mean change of the action from step to step in the second half of each episode, as
             a share of its half-range, ``[episodes]``; ``None`` where it was not measured.
+        violations: violations of the task's constraints by their names; ``None`` without any.
 
     Examples:
         >>> returns, lengths = torch.tensor([-200.0, -100.0]), torch.tensor([200, 200])
@@ -47,6 +50,7 @@ class Evaluation:
     terminated: Tensor
     seconds: float
     chatter: Tensor | None = None
+    violations: Mapping[str, Violations] | None = None
 
     @property
     def mean(self) -> float:
@@ -66,6 +70,8 @@ class Evaluation:
     def summary(self) -> dict[str, float]:
         """Return statistics of the episodes as numbers for a logger or a JSON file."""
         measured = {} if self.chatter is None else {"chatter": self.chatter.mean().item()}
+        for name, found in (self.violations or {}).items():
+            measured |= found.summary(name, self.lengths)
         return {
             "return_mean": self.mean,
             "return_std": self.std,
@@ -133,26 +139,29 @@ def evaluate(
     with torch.random.fork_rng(devices=cuda), torch.no_grad():
         torch.manual_seed(seed)
         if model is not None:
-            played = _play_model(policy, model, episodes, seed, device)
+            played = _play_model(policy, model, task, episodes, seed, device)
         else:
             assert env is not None  # one of the two is there
             env.set_seed(seed)
             rounds = math.ceil(episodes / env.batch_size.numel())
             columns = zip(*(_play_env(policy, env, task) for _ in range(rounds)), strict=True)
             played = tuple(torch.cat(column)[:episodes] for column in columns)
-    returns, lengths, terminated, chatter = (column.cpu() for column in played)
+    returns, lengths, terminated, chatter, steps, largest = (column.cpu() for column in played)
     seconds = time.perf_counter() - start
-    return Evaluation(task.name, seed, returns, lengths, terminated, seconds, chatter)
+    found = zip(task.limits.names, steps.unbind(-1), largest.unbind(-1), strict=True)
+    violations = {name: Violations(*each) for name, *each in found} or None
+    return Evaluation(task.name, seed, returns, lengths, terminated, seconds, chatter, violations)
 
 
 def _play_model(
     policy: TensorDictModuleBase,
     world: TaskWorldModel,
+    judged: Task,
     episodes: int,
     seed: int,
     device: torch.device,
 ) -> tuple[Tensor, ...]:
-    """Returns, lengths, terminations and chatter ``[episodes]`` in a simulated world.
+    """What a tally has of the episodes in a simulated world; ``judged`` has the constraints.
 
     An actor alone is four times as fast on the world's tensors as in the TorchRL environment.
     """
@@ -161,7 +170,7 @@ def _play_model(
     # By a generator of their own, as the first states are.
     drawn = outside.draw([episodes], task.max_steps + 1, torch.Generator().manual_seed(seed))
     drawn = {name: values.to(device) for name, values in drawn.items()}
-    tally = _Tally(task, episodes, device)
+    tally = _Tally(judged, episodes, device)
     for step in range(task.max_steps):
         if outside:
             state = task.with_signals(state, outside.window(drawn, step))
@@ -172,6 +181,8 @@ def _play_model(
         )
         action = policy(tensordict)["action"]
         next_state, reward, terminated = world.transition(state, action)
+        if judged.limits:
+            tally.judge(task.split(next_state)[0], task.command(task.split(state)[1], action))
         # The state of an episode that has ended is not changed any more.
         state = torch.where((tally.alive & ~terminated).unsqueeze(-1), next_state, state)
         if tally.add(action, reward, terminated, terminated):
@@ -180,7 +191,7 @@ def _play_model(
 
 
 def _play_env(policy: TensorDictModuleBase, env: EnvBase, task: Task) -> tuple[Tensor, ...]:
-    """Returns, lengths, terminations and chatter ``[n]`` of an episode in each world of ``env``."""
+    """What a tally has of an episode in each world of ``env``."""
     tensordict = env.reset()
     tally = _Tally(task, env.batch_size.numel(), tensordict.device)
     is_init = torch.ones([*env.batch_size, 1], dtype=torch.bool, device=tensordict.device)
@@ -189,11 +200,23 @@ def _play_env(policy: TensorDictModuleBase, env: EnvBase, task: Task) -> tuple[T
         # A world whose episode is over starts another, which does not count.
         tensordict, following = env.step_and_maybe_reset(tensordict)
         step = tensordict.get("next")
+        if task.limits:
+            tally.judge(*_judged(task, tensordict))
         is_init = step["done"]
         if tally.add(tensordict["action"], step["reward"], step["terminated"], is_init):
             break
         tensordict = following
     return tally.result()
+
+
+def _judged(task: Task, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """The physical state after a step of an environment, as it was shown, and the command."""
+    before, after = tensordict["observation"], tensordict["next", "observation"]
+    state = task.system.locate(after[..., : task.system.observation_dim])
+    if before.shape[-1] != task.observation_dim:  # what is under way is not shown
+        return state, task.clip_action(tensordict["action"])
+    registers = task.split(task.locate(before))[1]
+    return state, task.command(registers, tensordict["action"])
 
 
 class _Tally:
@@ -207,6 +230,15 @@ class _Tally:
         self.lengths = torch.zeros(count, dtype=torch.int64, device=device)
         self.terminated = torch.zeros(count, dtype=torch.bool, device=device)
         self.alive = torch.ones(count, dtype=torch.bool, device=device)
+        self.violated = torch.zeros(count, len(task.constraints), dtype=torch.int64, device=device)
+        self.largest = torch.zeros(count, len(task.constraints), device=device)
+
+    def judge(self, state: Tensor, command: Tensor) -> None:
+        """Judge a step before it is added, by its next state and its command."""
+        found = self.task.limits.violations(state, command).reshape(self.largest.shape)
+        found = torch.where(self.alive.unsqueeze(-1), found.to(self.largest.dtype), 0.0)
+        self.violated += found > 0
+        self.largest = torch.maximum(self.largest, found)
 
     def add(self, action: Tensor, reward: Tensor, terminated: Tensor, done: Tensor) -> bool:
         """Add a step; returns whether all episodes have ended."""
@@ -219,8 +251,12 @@ class _Tally:
         return not self.alive.any()
 
     def result(self) -> tuple[Tensor, ...]:
-        """Returns, lengths, terminations and chatter of the episodes, ``[n]`` each."""
-        return self.returns, self.lengths, self.terminated, self._chatter()
+        """Returns, lengths, terminations, chatter ``[n]``, and violations ``[n, c]``, by episode.
+
+        Violations are the steps of each constraint, and the largest.
+        """
+        own = self.returns, self.lengths, self.terminated, self._chatter()
+        return *own, self.violated, self.largest
 
     def _chatter(self) -> Tensor:
         """Mean change of the action in the second half of each episode; 0 where there is none."""

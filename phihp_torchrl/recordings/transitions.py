@@ -131,15 +131,16 @@ def _of(task: Task, log: Recording, goes_on: bool, left: Counter[str]) -> Tensor
     done = torch.ones(len(at), 1, dtype=torch.bool)
     done[:-1, 0] = at.diff() > 1
     reward = task.reward(state.float(), action[use].float(), following.float())
+    command = task.clip_action(action[use].float())
     return TensorDict(
         observation=observation[:-1][use].float(),
-        action=task.clip_action(action[use].float()),
+        action=command,
         time_step=log.intervals[use].float()[:, None],
         next=TensorDict(
             observation=observation[1:][use].float(),
             reward=reward[:, None],
             done=done,
-            terminated=task.is_terminated(following.float())[:, None],
+            terminated=task.is_terminated(following.float(), command)[:, None],
             batch_size=[len(at)],
         ),
         batch_size=[len(at)],

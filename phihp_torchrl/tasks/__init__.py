@@ -7,6 +7,7 @@ from phihp_torchrl.tasks.actuator import Actuator
 from phihp_torchrl.tasks.base import Task
 from phihp_torchrl.tasks.bounds import ActionBounds
 from phihp_torchrl.tasks.box import Box
+from phihp_torchrl.tasks.constraint import Constraint
 from phihp_torchrl.tasks.disturbance import Disturbance, DisturbancePart
 from phihp_torchrl.tasks.last_action import LastAction
 from phihp_torchrl.tasks.numbers import Numbers
@@ -20,6 +21,7 @@ __all__ = [
     "ActionBounds",
     "Actuator",
     "Box",
+    "Constraint",
     "Disturbance",
     "LastAction",
     "Part",

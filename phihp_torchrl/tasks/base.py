@@ -19,6 +19,8 @@ from phihp_torchrl.tasks.actuator import Actuator
 from phihp_torchrl.tasks.actuator_part import ActuatorPart
 from phihp_torchrl.tasks.bounds import read_limits
 from phihp_torchrl.tasks.box import Box
+from phihp_torchrl.tasks.constraint import Constraint
+from phihp_torchrl.tasks.constraints import Constraints
 from phihp_torchrl.tasks.disturbance import Disturbance, DisturbancePart
 from phihp_torchrl.tasks.last_action import LastAction
 from phihp_torchrl.tasks.numbers import Numbers, check_each, read_numbers
@@ -74,6 +76,8 @@ class Task(Steps):
         inputs: what acts on the system without being commanded, and is measured, such as wind. Its
             components are the system's :attr:`~phihp_torchrl.System.input_names`.
         disturbance: an unmeasured drift that lasts, which an agent estimates while it acts.
+        constraints: limits of states, or of functions of state and action: soft ones at a price,
+            hard ones that end the episode. Evaluations report their violations.
 
     Raises:
         ConfigError: for a field whose length or range does not fit the system; the message names
@@ -111,6 +115,7 @@ class Task(Steps):
     reference: Signal | None = None
     inputs: Signal | None = None
     disturbance: Disturbance | None = None
+    constraints: tuple[Constraint, ...] = ()
 
     layout: StateLayout = field(init=False, repr=False, compare=False)
     """Positions, velocities and their limits, for integrators."""
@@ -118,6 +123,8 @@ class Task(Steps):
     """What the task adds to the physical state."""
     outside: Outside = field(init=False, repr=False, compare=False)
     """The reference and the inputs, which are the first of the registers."""
+    limits: Constraints = field(init=False, repr=False, compare=False)
+    """The constraints, as functions of tensors."""
     _reads: dict[str, tuple[str, ...]] = field(
         init=False, repr=False, compare=False, default_factory=dict
     )
@@ -146,6 +153,8 @@ class Task(Steps):
         object.__setattr__(self, "position_limits", dict(self.position_limits))
         layout = self.system.layout(self.velocity_limits, self.position_limits, self.restitution)
         object.__setattr__(self, "layout", layout)
+        object.__setattr__(self, "limits", Constraints(self.constraints, self.system, self.reset))
+        object.__setattr__(self, "constraints", self.limits.each)
         self._check_outside()
         parts = self.parts()
         object.__setattr__(self, "registers", Registers(parts))
@@ -206,4 +215,8 @@ class Task(Steps):
 
     def unpriced(self) -> Task:
         """Return the task as a world plays it: with the same state, and rewards without prices."""
-        return replace(self, action_rate_cost=0.0) if self.action_rate_cost else self
+        constraints = self.limits.unpriced()
+        if not self.action_rate_cost and constraints == self.constraints:
+            return self
+        cost = None if self.action_rate_cost is None else 0.0
+        return replace(self, action_rate_cost=cost, constraints=constraints)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.tasks.constraints import Constraints
 from phihp_torchrl.tasks.states import States
 
 RewardFn = Callable[..., Tensor]
@@ -56,6 +58,8 @@ class Steps(States):
         @property
         def terminated(self) -> TerminatedFn | None: ...
         @property
+        def limits(self) -> Constraints: ...
+        @property
         def _reads(self) -> Mapping[str, tuple[str, ...]]: ...
 
     def command(self, registers: Tensor, action: Tensor) -> Tensor:
@@ -102,9 +106,9 @@ class Steps(States):
                 moved = moved + self.time_step * drift
             next_state = torch.cat([moved, after], -1)
         reward = self.earned(state, action, next_state)
-        if (price := self.registers.price(registers, action)) is not None:
+        if (price := self._price(registers, action, moved)) is not None:
             reward = reward - price
-        return Transition(next_state, reward, self.is_terminated(next_state))
+        return Transition(next_state, reward, self.is_terminated(next_state, action))
 
     def earned(self, state: Tensor, command: Tensor, next_state: Tensor) -> Tensor:
         """The reward of a step without prices, ``[*batch]``.
@@ -124,7 +128,9 @@ class Steps(States):
         values = self.outside.values(registers)
         return {key: values[key] for key in keys}
 
-    def price(self, state: Tensor, action: Tensor) -> Tensor | None:
+    def price(
+        self, state: Tensor, action: Tensor, next_state: Tensor | None = None
+    ) -> Tensor | None:
         """What a step costs where the task is imagined, ``[*batch]``; ``None`` for nothing.
 
         A world gives rewards without prices, so whoever learns from its steps subtracts them.
@@ -132,13 +138,31 @@ class Steps(States):
         Args:
             state: the state before the step, ``[*batch, n]``.
             action: the action of the step, ``[*batch, m]``.
+            next_state: the state after it, ``[*batch, n]``, which constraints are judged by.
+
+        Raises:
+            ConfigError: without a ``next_state`` where the task has constraints.
         """
         _, registers = self.split(state)
-        return self.registers.price(registers, self.command(registers, action))
+        moved = None if next_state is None else self.split(next_state)[0]
+        return self._price(registers, self.command(registers, action), moved)
 
-    def is_terminated(self, next_state: Tensor) -> Tensor:
-        """Whether ``next_state`` ``[*batch, n]`` ends the episode, bool ``[*batch]``."""
-        if self.terminated is None:
-            return torch.zeros(next_state.shape[:-1], dtype=torch.bool, device=next_state.device)
+    def _price(self, registers: Tensor, command: Tensor, moved: Tensor | None) -> Tensor | None:
+        if self.limits and moved is None:
+            raise ConfigError("next_state", "expected one, for the task has constraints.")
+        price = self.registers.price(registers, command)
+        more = None if moved is None else self.limits.price(moved, command)
+        return price if more is None else more if price is None else price + more
+
+    def is_terminated(self, next_state: Tensor, command: Tensor | None = None) -> Tensor:
+        """Whether ``next_state`` ``[*batch, n]`` ends the episode, bool ``[*batch]``.
+
+        The command ``[*batch, m]`` is needed where a hard constraint reads the action.
+        """
         moved, registers = self.split(next_state)
-        return self.terminated(moved, **self._signals_of("terminated", registers))
+        ended = self.limits.ended(moved, command)
+        if self.terminated is None:
+            none = torch.zeros(next_state.shape[:-1], dtype=torch.bool, device=next_state.device)
+            return none if ended is None else ended
+        own = self.terminated(moved, **self._signals_of("terminated", registers))
+        return own if ended is None else own | ended

@@ -111,7 +111,7 @@ class TOLD(nn.Module):
             task.observation_dim,
             task.bounds,
             config,
-            terminates=task.terminated is not None,
+            terminates=task.terminated is not None or task.limits.ends_episodes,
         )
 
     @property

@@ -296,7 +296,8 @@ def _as_floats(task: Task, rollout: TensorDictBase) -> TensorDict:
     """Return the entries of an episode that replay keeps, in float32; rewards less their prices."""
     following = rollout["next"]
     reward = following["reward"].float()
-    price = task.price(task.locate(rollout["observation"].float()), rollout["action"].float())
+    before, after = (task.locate(td["observation"].float()) for td in (rollout, following))
+    price = task.price(before, rollout["action"].float(), after)
     if price is not None:
         reward = reward - price.unsqueeze(-1)
     return TensorDict(

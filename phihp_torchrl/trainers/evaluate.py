@@ -29,8 +29,6 @@ from phihp_torchrl.worlds import GuardedWorld, World, crossings_text
 
 _log = logging.getLogger(__name__)
 
-_log = logging.getLogger(__name__)
-
 
 @dataclass(frozen=True)
 class EvaluateConfig:
@@ -182,6 +180,9 @@ class EvaluatePhase:
         if beside:
             table = controllers_table("controller", {**self.results, **beside})
             _log.info("The agent beside controllers by hand in its model:\n%s", table)
+        elif self.agent.task.constraints and self.results:
+            table = controllers_table("controller", self.results)
+            _log.info("The agent, and its violations of constraints:\n%s", table)
         return beside
 
     def _save(self, beside: Mapping[str, dict[str, Any]]) -> None:

@@ -122,8 +122,9 @@ def replay_batch(task: Task, data: TensorDict | None) -> Batch:
     next_state = task.locate(data["next", "observation"])
     action = data["action"]
     # "done" in the data includes truncations, which are not terminations.
-    terminated = task.is_terminated(next_state)
-    reward, price = data["next", "reward"][:, 0], task.price(state, action)
+    command = task.command(task.split(state)[1], action)
+    terminated = task.is_terminated(next_state, command)
+    reward, price = data["next", "reward"][:, 0], task.price(state, action, next_state)
     reward = reward if price is None else reward - price
     return Batch(state, action, reward, next_state, terminated)
 

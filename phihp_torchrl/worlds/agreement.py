@@ -41,7 +41,8 @@ def disagreements(task: Task, data: TensorDictBase) -> list[str]:
     """
     state = task.locate(data["observation"])
     next_state = task.locate(data["next", "observation"])
-    ours = task.is_terminated(next_state)
+    command = task.command(task.split(state)[1], data["action"])
+    ours = task.is_terminated(next_state, command)
     theirs = data["next", "terminated"].reshape(-1)
     found = []
     if early := int((theirs & ~ours).sum()):
@@ -54,7 +55,6 @@ def disagreements(task: Task, data: TensorDictBase) -> list[str]:
             f"the world went on after {late} of {len(theirs)} steps that the task says are the "
             "last, so imagined lives will be shorter than real ones"
         )
-    command = task.command(task.split(state)[1], data["action"])
     expected = task.earned(state, command, next_state)
     given = data["next", "reward"].reshape(-1)
     difference = (given - expected).abs().mean().item()

@@ -23,6 +23,7 @@ from phihp_torchrl.config import ConfigError, import_named
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.command_memory import command_memory
+from phihp_torchrl.worlds.constraint_end import ConstraintEnd
 from phihp_torchrl.worlds.signal_source import signal_source
 
 
@@ -141,6 +142,8 @@ def fit_env(task: Task, env: EnvBase) -> EnvBase:
     transforms += signal_source(task, env)
     if env.observation_spec["observation"].shape[-1] != task.observation_dim:
         transforms += command_memory(task)
+    if task.limits.ends_episodes:
+        transforms.append(ConstraintEnd(task))
     return TransformedEnv(env, Compose(*transforms)) if transforms else env
 
 

@@ -11,8 +11,9 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from phihp_torchrl import Agent, get_task
+from phihp_torchrl import Agent, Constraint, get_task
 from phihp_torchrl.agents import Actor
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment import Controller, Safety
 from phihp_torchrl.tasks import Actuator
 
@@ -189,3 +190,24 @@ def test_what_does_not_fit_is_named():
     for name in ("deadline", "max_age", "mismatch", "max_change"):
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             Safety(**{name: 0.0})
+
+
+def test_the_fallback_takes_over_outside_the_constraints_of_the_task():
+    """The agent acts at 0.5 rad/s and not at 2; and never with more than 1 W."""
+    slow = Constraint("theta_dot", low=-1.0, high=1.0, price=1.0)
+    power = Constraint(
+        "power", high=0.9, price=1.0, function=lambda s, action: s[..., 1] * action[..., 0]
+    )
+    for constraints, reasons in (((slow,), 1), ((slow, power), 2)):
+        task = replace(PENDULUM, constraints=constraints)
+        agent = policy(lambda o: torch.full((1,), 2.0))
+        control = Controller(
+            agent, task, safety=Safety(constraints=True), fallback=lambda o: [-1.0]
+        )
+        sent = [control.step([1.0, 0.0, speed]).item() for speed in (0.0, 0.5, 2.0)]
+        assert sent == [2.0, 2.0 if reasons == 1 else -1.0, -1.0]
+        assert control.report().reasons == {"constraint": reasons}
+    free = Controller(agent, task)
+    assert free.step([1.0, 0.0, 2.0]).item() == 2.0
+    with pytest.raises(ConfigError, match="constraints: expected a task with constraints"):
+        controller(lambda o: o, safety=Safety(constraints=True))

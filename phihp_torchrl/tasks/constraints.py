@@ -1,0 +1,142 @@
+"""All constraints of a task: what violates them, what that costs, and what it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.systems import System, wrap
+from phihp_torchrl.tasks.box import Box
+from phihp_torchrl.tasks.constraint import Constraint
+
+
+class Constraints:
+    """The constraints of a task on its system, as functions of tensors.
+
+    Args:
+        each: the constraints.
+        system: the system, which names states and angles; angles are judged in [-pi, pi).
+        reset: box of the states in which episodes start.
+
+    Raises:
+        ConfigError: naming the constraint: for the name of no state, a name that is there twice, a
+            function that gives no value for each state, and a hard one outside which episodes
+            start.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> task = get_task("cartpole-swingup")
+        >>> limits = Constraints([Constraint("x", -1.0, 1.0, price=5.0)], task.system, task.reset)
+        >>> state = torch.tensor([[0.5, 0.0, 0.0, 0.0], [1.2, 0.0, 0.0, 0.0]])
+        >>> limits.violations(state)
+        tensor([[0.0000],
+                [0.2000]])
+        >>> limits.price(state)
+        tensor([0.0000, 1.0000])
+    """
+
+    def __init__(self, each: Sequence[Constraint], system: System, reset: Box) -> None:
+        if not isinstance(each, (tuple, list)) or not all(isinstance(c, Constraint) for c in each):
+            raise ConfigError("constraints", f"expected a tuple of Constraint, got {each!r}.")
+        self.each = tuple(each)
+        self.names = tuple(constraint.name for constraint in each)
+        self._system, self._reset = system, reset
+        for constraint in self.each:
+            self._check(constraint)
+
+    def __bool__(self) -> bool:
+        return bool(self.each)
+
+    @property
+    def ends_episodes(self) -> bool:
+        """Whether one of them is hard."""
+        return any(constraint.hard for constraint in self.each)
+
+    def unpriced(self) -> tuple[Constraint, ...]:
+        """The same constraints, soft ones only reported."""
+        return tuple(replace(c, price=0.0) if c.price else c for c in self.each)
+
+    def violations(self, state: Tensor, command: Tensor | None = None) -> Tensor:
+        """How far each is violated after a step, in its physical units, ``[*batch, c]``.
+
+        Args:
+            state: physical state after the step, ``[*batch, n]``.
+            command: command of the step, ``[*batch, m]``; needed by functions that read it.
+
+        Raises:
+            ConfigError: where a function reads the command, and there is none.
+        """
+        found = [self._violation(constraint, state, command) for constraint in self.each]
+        return torch.stack(found, -1) if found else state.new_zeros([*state.shape[:-1], 0])
+
+    def price(self, state: Tensor, command: Tensor | None = None) -> Tensor | None:
+        """What the violations of a step cost, ``[*batch]``; ``None`` where none has a price."""
+        total = None
+        for constraint in self.each:
+            if not constraint.price:
+                continue
+            violation = self._violation(constraint, state, command)
+            paid = (violation > 0).to(violation.dtype) if constraint.hard else violation
+            paid = constraint.price * paid
+            total = paid if total is None else total + paid
+        return total
+
+    def ended(self, state: Tensor, command: Tensor | None = None) -> Tensor | None:
+        """Whether a hard one is violated, bool ``[*batch]``; ``None`` where none is hard."""
+        ended = None
+        for constraint in self.each:
+            if constraint.hard:
+                beyond = self._violation(constraint, state, command) > 0
+                ended = beyond if ended is None else ended | beyond
+        return ended
+
+    def _violation(self, constraint: Constraint, state: Tensor, command: Tensor | None) -> Tensor:
+        name, function = constraint.name, constraint.function
+        if function is None:
+            value = state[..., self._system.state_names.index(name)]
+            return constraint.violation(wrap(value) if name in self._system.angles else value)
+        if not constraint.reads_action:
+            return constraint.violation(function(state))
+        if command is None:
+            raise ConfigError(f"constraints.{name}", "expected the command, which it reads.")
+        return constraint.violation(function(state, action=command))
+
+    def _check(self, constraint: Constraint) -> None:
+        name, system = constraint.name, self._system
+        if self.names.count(name) > 1:
+            raise ConfigError(f"constraints.{name}", "expected a name of its own, got it twice.")
+        if constraint.function is not None:
+            states, actions = torch.zeros(2, system.state_dim), torch.zeros(2, system.action_dim)
+            value = self._violation(constraint, states, actions)
+            if value.shape != (2,):
+                raise ConfigError(
+                    f"constraints.{name}.function",
+                    f"expected [*batch] for states [*batch, {system.state_dim}], so [2] for 2, "
+                    f"got {list(value.shape)}.",
+                )
+            return
+        if name not in system.state_names:
+            raise ConfigError(
+                f"constraints.{name}",
+                f"expected one of the states {system.state_names}, or a function.",
+            )
+        if name in system.angles:
+            limits = [v for v in (constraint.low, constraint.high) if v is not None]
+            if any(abs(value) > torch.pi for value in limits):
+                raise ConfigError(
+                    f"constraints.{name}",
+                    f"expected limits of an angle in [-pi, pi], got {limits}.",
+                )
+            return
+        index = system.state_names.index(name)
+        ends = torch.tensor([self._reset.low[index], self._reset.high[index]], dtype=torch.float64)
+        if constraint.hard and (constraint.violation(ends) > 0).any():
+            raise ConfigError(
+                f"constraints.{name}",
+                "expected limits around the task's reset box, "
+                f"{ends[0].item():g} to {ends[1].item():g}, since episodes start there.",
+            )
