@@ -48,7 +48,7 @@ class Constraint:
         >>> Constraint("x", high=1.0)
         Traceback (most recent call last):
         ...
-        phihp_torchrl.config.ConfigError: constraints.x.price: expected a price, or hard=True; ...
+        phihp_torchrl.config.ConfigError: constraints.x.price: expected a price, or hard=True.
     """
 
     name: str
@@ -73,7 +73,7 @@ class Constraint:
         if not isinstance(self.hard, bool):
             raise self._error("hard", f"expected true or false, got {self.hard!r}.")
         if self.price is None and not self.hard:
-            raise self._error("price", "expected a price, or hard=True; 0 only reports violations.")
+            raise self._error("price", "expected a price, or hard=True.")
         if self.price is not None and self.price < 0:
             raise self._error("price", f"expected a number >= 0, got {self.price}.")
         if self.function is not None and not callable(self.function):
