@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from phihp_torchrl.imagination import WorldModelEnv
     from phihp_torchrl.planners import CEMPlanner, MPPIPlanner, register_planner
     from phihp_torchrl.systems import Constant, LagrangianSystem, System
-    from phihp_torchrl.tasks import Box, Task, get_task, register_task
+    from phihp_torchrl.tasks import Box, Signal, Task, get_task, register_task
     from phihp_torchrl.trainers import RunConfig, RunResult, register_phase, run
     from phihp_torchrl.worlds import Plant, World, make_world, register_plant, register_world
 
@@ -35,7 +35,16 @@ _HOMES = {
     "imagination": ("WorldModelEnv",),
     "planners": ("CEMPlanner", "MPPIPlanner", "register_planner"),
     "systems": ("Constant", "LagrangianSystem", "System"),
-    "tasks": ("Actuator", "Box", "Task", "get_task", "register_task"),
+    "tasks": (
+        "Actuator",
+        "Box",
+        "Disturbance",
+        "Signal",
+        "Task",
+        "Trajectories",
+        "get_task",
+        "register_task",
+    ),
     "trainers": ("RunConfig", "RunResult", "register_phase", "run"),
     "worlds": ("Plant", "World", "make_world", "register_plant", "register_world"),
 }
@@ -48,6 +57,7 @@ __all__ = [
     "CEMPlanner",
     "ConfigError",
     "Constant",
+    "Disturbance",
     "DynamicsLoss",
     "HybridDynamics",
     "LagrangianSystem",
@@ -56,9 +66,11 @@ __all__ = [
     "Plant",
     "RunConfig",
     "RunResult",
+    "Signal",
     "System",
     "Task",
     "TaskWorldModel",
+    "Trajectories",
     "World",
     "WorldModelEnv",
     "evaluate",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from phihp_torchrl.agents.analytic_update import AnalyticConfig, AnalyticUpdate, Draws
+from phihp_torchrl.agents.analytic_config import AnalyticConfig
+from phihp_torchrl.agents.analytic_update import AnalyticUpdate, Draws
 from phihp_torchrl.agents.equations import Layers, act, q_values, soft_update_
 from phihp_torchrl.agents.networks import (
     Actor,

@@ -25,11 +25,14 @@ limited on their way.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.func import vjp
+from torch.nn import functional as F
 from torchrl.objectives.value.functional import td_lambda_return_estimate
 
 from phihp_torchrl.agents.equations import Layers, act, mlp, q_values
@@ -127,10 +130,10 @@ def pull_step(
         :math:`\lambda_t` ``[N, n]``, :math:`g_t` ``[N, m]``, and which rows were limited or left
         out, bool ``[N]``.
     """
-    action, pull_action = vjp(
+    action, pull_action = _with_pull(
         lambda s: noisy_action(actor, world_model.observe(s), noise, bounds), state
     )
-    (_, reward), pull = vjp(
+    (_, reward), pull = _with_pull(
         lambda s, a: tuple(finite_transition(world_model.transition, s, a)[:2]), state, action
     )
     to_state, to_action = pull((adjoint, torch.ones_like(reward)))
@@ -148,10 +151,28 @@ def pull_step(
     )
 
 
+def _with_pull(function: Callable[..., Any], *inputs: Tensor) -> tuple[Any, Callable[..., Any]]:
+    """The function's value, and the function that carries gradients back from it."""
+    found = vjp(function, *inputs)
+    return found[0], found[1]
+
+
 def followed(
-    actor: Layers, observation: Tensor, noise: Tensor, gradient: Tensor, bounds: ActionBounds
+    actor: Layers,
+    observation: Tensor,
+    noise: Tensor,
+    gradient: Tensor,
+    bounds: ActionBounds,
+    entropy: Tensor,
 ) -> Tensor:
-    r"""The loss whose gradient is that of the returns: :math:`-\sum_t g_t^\top \pi(s_t)`, averaged.
+    r"""The loss whose gradient is that of the returns and of the entropy, averaged over steps.
+
+    .. math::
+        -\sum_t g_t^\top \pi(s_t) - \alpha \log (1 - \tanh^2 u_t)
+
+    The second term is the entropy of the noisy actor but for a constant, because the noise on its
+    output :math:`u` has a given size (SAPO, arXiv:2412.12089, learns that size). It keeps the tanh
+    away from its ends, where neither noise nor gradients get through.
 
     Args:
         actor: layers of the actor.
@@ -159,9 +180,13 @@ def followed(
         noise: their noise, ``[H * N, m]``.
         gradient: the returns' gradients by the actions, constants here, ``[H * N, m]``.
         bounds: bounds of the action.
+        entropy: weight α of the entropy, in the units of the returns.
     """
-    action = noisy_action(actor, observation, noise, bounds)
-    return -(action * gradient).sum(-1).mean()
+    output = mlp(actor, observation) + noise
+    # log(1 - tanh²) in a form that stays finite.
+    spread = 2.0 * (math.log(2.0) - output - F.softplus(-2.0 * output))
+    action = bounds.from_unit(output.tanh())
+    return -(action * gradient + entropy * spread).sum(-1).mean()
 
 
 def limited(gradients: Layers, most: float) -> tuple[list[Tensor], Tensor]:

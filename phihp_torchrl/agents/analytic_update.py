@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -18,16 +17,10 @@ from phihp_torchrl.agents.analytic import (
     pull_step,
     state_values,
 )
+from phihp_torchrl.agents.analytic_config import AnalyticConfig
 from phihp_torchrl.agents.equations import adam_, adam_rates, critic_loss, soft_update_
 from phihp_torchrl.agents.update import ActorCriticUpdate, Networks
 from phihp_torchrl.compilation import compile_graph
-from phihp_torchrl.config import (
-    check_count,
-    check_not_negative,
-    check_positive,
-    check_positive_share,
-    check_share,
-)
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Batch
 from phihp_torchrl.tasks import ActionBounds
@@ -37,55 +30,8 @@ _logger = logging.getLogger(__name__)
 # The range of returns is that of the central 90 %, averaged over about 100 updates.
 _TAIL, _MEMORY = 0.05, 0.99
 _SMALLEST_RANGE = 1e-6
-
-
-@dataclass(frozen=True)
-class AnalyticConfig:
-    """Hyper-parameters of policy gradients through the model; the networks and γ are TD3's.
-
-    Args:
-        horizon: steps of the model through which the gradient of a return goes; the critics' value
-            follows.
-        trace: λ of the critics' TD(λ) targets.
-        noise: std of the noise on the actor's output before its tanh, at first; it falls with the
-            learning rates.
-        critic_updates: critic updates for each update of the actor, which share the imagined steps
-            between them.
-        actor_learning_rate: learning rate of the actor.
-        critic_learning_rate: learning rate of the critics.
-        tau: step τ of the target critics towards the critics, in each update of the actor.
-        step_limit: largest change of a return that an action may claim, for its half-range in one
-            step, in units of the range of returns; gradients beyond are scaled down to it.
-        norm_limit: largest norm of the actor's gradient, for returns in units of their range.
-
-    Raises:
-        ConfigError: for a value out of range; the message names the field.
-
-    Examples:
-        >>> AnalyticConfig(horizon=0)
-        Traceback (most recent call last):
-        ...
-        phihp_torchrl.config.ConfigError: horizon: expected a whole number >= 1, got 0.
-    """
-
-    horizon: int = 16
-    trace: float = 0.95
-    noise: float = 0.3
-    critic_updates: int = 4
-    actor_learning_rate: float = 1e-3
-    critic_learning_rate: float = 1e-3
-    tau: float = 0.1
-    step_limit: float = 1.0
-    norm_limit: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_count(self, "horizon", "critic_updates")
-        check_share(self, "trace")
-        check_not_negative(self, "noise")
-        check_positive(
-            self, "actor_learning_rate", "critic_learning_rate", "step_limit", "norm_limit"
-        )
-        check_positive_share(self, "tau")
+# The first gradients are by far the largest; Adam's usual decay rates would remember them for long.
+_ACTOR_BETAS = (0.7, 0.95)
 
 
 class Draws(NamedTuple):
@@ -159,7 +105,7 @@ class AnalyticUpdate(ActorCriticUpdate):
         Args:
             state: the states of the worlds.
             draws: the random numbers of the update.
-            learning_rate_scale: factor on both learning rates.
+            learning_rate_scale: factor on both learning rates and the entropy.
 
         Returns:
             The transitions ``[H * N]``, the new states of the worlds ``[N, n]``, and scalars:
@@ -194,7 +140,12 @@ class AnalyticUpdate(ActorCriticUpdate):
             draws.noise.flatten(0, 1),
             torch.stack(gradients[::-1]).flatten(0, 1) / self.return_range,
             draws.order,
-            adam_rates(self.steps + 1, learning_rate_scale * config.actor_learning_rate),
+            self.return_range.new_tensor(learning_rate_scale * config.entropy),
+            adam_rates(
+                self.steps + 1,
+                learning_rate_scale * config.actor_learning_rate,
+                betas=_ACTOR_BETAS,
+            ),
             adam_rates(
                 self.steps * config.critic_updates + counts,
                 learning_rate_scale * config.critic_learning_rate,
@@ -270,6 +221,7 @@ class AnalyticUpdate(ActorCriticUpdate):
         noise: Tensor,
         gradient: Tensor,
         order: Tensor,
+        entropy: Tensor,
         actor_rates: tuple[Tensor, Tensor],
         critic_rates: tuple[Tensor, Tensor],
         bounds: ActionBounds,
@@ -278,15 +230,24 @@ class AnalyticUpdate(ActorCriticUpdate):
         config = self.config
         observation = self.world_model.observe(state)
         moves, norm = limited(
-            torch.func.grad(followed)(nets.actor, observation, noise, gradient, bounds),
+            torch.func.grad(followed)(nets.actor, observation, noise, gradient, bounds, entropy),
             config.norm_limit,
         )
         rows = (part[order].chunk(config.critic_updates) for part in (observation, action, target))
-        for i, batch in enumerate(zip(*rows, strict=True)):
-            slopes, loss = torch.func.grad_and_value(critic_loss)(nets.critics, *batch, bounds)
+        for i, (seen, done, value) in enumerate(zip(*rows, strict=True)):
+            slopes, loss = torch.func.grad_and_value(critic_loss)(
+                nets.critics, seen, done, value, bounds
+            )
             rates = (rate[i] for rate in critic_rates)
             adam_(nets.critics, slopes, nets.critic_means, nets.critic_squares, *rates)
-        adam_(nets.actor, moves, nets.actor_means, nets.actor_squares, *actor_rates)
+        adam_(
+            nets.actor,
+            moves,
+            nets.actor_means,
+            nets.actor_squares,
+            *actor_rates,
+            betas=_ACTOR_BETAS,
+        )
         soft_update_(nets.target_critics, nets.critics, config.tau)
         soft_update_(nets.target_actor, nets.actor, 1.0)
         return loss, norm

@@ -127,7 +127,12 @@ ADAM_BETAS = (0.9, 0.999)
 """Decay rates of Adam's first and second moments."""
 
 
-def adam_rates(step: Tensor, learning_rate: float, eps: float = 1e-8) -> tuple[Tensor, Tensor]:
+def adam_rates(
+    step: Tensor,
+    learning_rate: float,
+    eps: float = 1e-8,
+    betas: tuple[float, float] = ADAM_BETAS,
+) -> tuple[Tensor, Tensor]:
     """Compute the two scalars of a step of Adam that do not depend on the gradient.
 
     They are computed once a step, outside :func:`adam_`, rather than once for each tensor.
@@ -136,19 +141,27 @@ def adam_rates(step: Tensor, learning_rate: float, eps: float = 1e-8) -> tuple[T
         step: number of this step, from 1, any shape.
         learning_rate: learning rate.
         eps: the term that :class:`torch.optim.Adam` adds to the denominator.
+        betas: decay rates of the moments.
 
     Returns:
         The step size, and the term to add to the root of the second moment, both float32.
     """
     step = step.to(torch.float64)
-    beta1, beta2 = ADAM_BETAS
+    beta1, beta2 = betas
     root = (1.0 - beta2**step).sqrt()
     size = learning_rate * root / (1.0 - beta1**step)
     return size.to(torch.float32), (eps * root).to(torch.float32)
 
 
 def adam_(
-    params: Layers, grads: Layers, means: Layers, squares: Layers, size: Tensor, eps: Tensor
+    params: Layers,
+    grads: Layers,
+    means: Layers,
+    squares: Layers,
+    size: Tensor,
+    eps: Tensor,
+    *,
+    betas: tuple[float, float] = ADAM_BETAS,
 ) -> None:
     """Take one step of Adam in place, as :class:`torch.optim.Adam` defines it.
 
@@ -159,8 +172,9 @@ def adam_(
         squares: second moments, changed in place.
         size: scalar of :func:`adam_rates`.
         eps: scalar of :func:`adam_rates`.
+        betas: decay rates of the moments, those of :func:`adam_rates`.
     """
-    beta1, beta2 = ADAM_BETAS
+    beta1, beta2 = betas
     for param, grad, mean, square in zip(params, grads, means, squares, strict=True):
         mean.lerp_(grad, 1.0 - beta1)
         square.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)

@@ -55,9 +55,12 @@ def find_energy(task: Task, dynamics: nn.Module | None = None) -> tuple[Energy, 
 
 
 def starts_low(task: Task) -> bool:
-    """Whether a task's episodes may start with less than half of the energy upright."""
+    """Whether a task's episodes may start with less than half of the energy upright.
+
+    A task with inputs, whose power is unknown here, counts as none.
+    """
     found = find_energy(task)
-    if found is None:
+    if found is None or task.inputs is not None:
         return False
     energy, constants = found
     box = task.reset

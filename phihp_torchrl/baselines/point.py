@@ -28,7 +28,7 @@ class LinearModel:
     """A task's one step around a state at rest: ``z[k+1] = A z[k] + B u[k]``.
 
     ``z`` is the difference to the point's state, of angles on the circle, and ``u`` that to its
-    action. For a task with an actuator both have its registers, unless they were left out.
+    action. ``z`` has the registers of the task too, unless they were left out.
 
     Args:
         task: the task.
@@ -90,17 +90,24 @@ def linearise(
         dynamics: the model, ``(state, action) -> next state``.
         goal: the physical state at which to linearise. Defaults to the task's goal: the centre of
             its box ``goal``, or else a state at rest whose reward no state of the wide box exceeds.
-        registers: whether the registers of an actuator belong to the state.
+        registers: whether the task's registers, such as commands under way and the last action,
+            belong to the state. With an estimated disturbance they are left out.
 
     Raises:
-        ConfigError: where there is no such state, or the model does not rest in it.
+        ConfigError: where there is no such state, or the model does not rest in it, and for a task
+            with a reference or inputs, whose goal moves.
     """
+    for name in ("reference", "inputs"):
+        if getattr(task, name) is not None:
+            raise ConfigError(name, f"expected none for a fixed goal, {task.name!r} has {name}.")
     dynamics = copy.deepcopy(dynamics).to(device="cpu", dtype=torch.float64)
     step = physical_step(dynamics)
     state, action = _rest(task, step, goal)
     at, move = state, step
-    if registers and task.register_count:
-        at, move = torch.cat([state, _under_way(task, action)]), _with_registers(task, step)
+    # An estimated disturbance is no action's to move.
+    if registers and task.register_count and task.disturbance is None:
+        at = torch.cat([state, task.registers.rest(action)])
+        move = _with_registers(task, step)
     with torch.no_grad():
         a, b = (m.detach().numpy() for m in jacfwd(move, (0, 1))(at, action))
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
@@ -117,12 +124,6 @@ def _with_registers(task: Task, step: Step) -> Step:
         return torch.cat([step(physical, acting), waiting], -1)
 
     return move
-
-
-def _under_way(task: Task, action: Tensor) -> Tensor:
-    """The registers after ``action`` ``[m]`` has been held for long, ``[r]``."""
-    assert task.actuator is not None
-    return task.actuator.rest(action)
 
 
 def _rest(task: Task, step: Step, goal: Sequence[float] | None) -> tuple[Tensor, Tensor]:

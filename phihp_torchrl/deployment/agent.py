@@ -94,7 +94,7 @@ class Agent(TensorDictModuleBase):
             planner_config = resolve_seconds(planner_config, task.time_step)
         self.planner_config = planner_config
         self.metadata = dict(metadata or {})
-        self._memory = UnderWay(task) if task.register_count else None
+        self._memory = UnderWay(task, dynamics) if task.register_count else None
         self.planner = None
         if use_planner and planner_config is not None:
             self.planner = self._make_planner(planner_config, compile)
@@ -117,6 +117,10 @@ class Agent(TensorDictModuleBase):
         holds for a task with registers (an actuator, a limit or a price of the action's rate), if
         the observation is the system's alone: the agent then remembers its own commands. Where the
         task limits the rate, the action written is within it.
+
+        A task's reference and inputs are read from ``"reference"`` and ``"inputs"``, unless they
+        are in the observation: ``[*batch, k]``, or with their preview ``[*batch, rows, k]``. They
+        are needed where an episode starts; later steps keep the last value if the key is missing.
         """
         with torch.no_grad():
             if self._memory is not None and self._memory.is_asked(tensordict):

@@ -105,6 +105,7 @@ def save_agent(
         "kind": agent.kind,
         "task": asdict(TaskSignature.of(agent.task)),
         **_additions(agent.task),
+        **({"outside": outside} if (outside := _outside(agent.task)) else {}),
         **config,
         "weights_sha256": hashlib.sha256(data).hexdigest(),
         "metadata": dict(agent.metadata if metadata is None else metadata),
@@ -179,6 +180,11 @@ def load_agent(
         raise AgentError(f"{path}: {error}") from error
     task = _resolve_task(path, signature, task)
     task = _with_additions(path, task, content)
+    if (saved := content.get("outside", {})) != (ours := _outside(task)):
+        raise AgentError(
+            f"{path}: task {task.name!r} is another one here: expected the reference, inputs and "
+            f"disturbance {saved}, got {ours}."
+        )
     weights = _read_weights(directory / WEIGHTS_FILE, kind, task, content)
     device = _check_device(device)
     try:
@@ -260,6 +266,15 @@ def _resolve_task(path: Path, saved: TaskSignature, wanted: str | Task | None) -
     return task
 
 
+def _outside(task: Task) -> dict[str, Any]:
+    """The reference, inputs and disturbance that an agent depends on, as plain values."""
+    disturbance = task.disturbance
+    return {
+        **task.outside.config,
+        **({} if disturbance is None else {"disturbance": disturbance.config}),
+    }
+
+
 _RATES = ("action_rate_limit", "action_rate_cost")
 
 
@@ -285,7 +300,7 @@ def _with_additions(path: Path, task: Task, content: Mapping[str, Any]) -> Task:
                 f"{path}: task {task.name!r} is another one here: expected its {name} {here}, "
                 f"got {saved}."
             )
-    return changed
+    return task if changed == task else changed
 
 
 def _read_weights(

@@ -180,7 +180,11 @@ class HybridDynamics(nn.Module):
 
     def forward(self, state: Tensor, action: Tensor, time_step: Tensor | None = None) -> Tensor:
         """The next state: ``[*batch, n], [*batch, m] -> [*batch, n]``; the action is clipped."""
-        return self.step(state, self.task.clip_action(action), time_step)
+        count = self.task.action_dim
+        clipped = self.task.clip_action(action[..., :count])
+        if self.task.system.input_names:
+            clipped = torch.cat([clipped, action[..., count:]], -1)
+        return self.step(state, clipped, time_step)
 
     def step(self, state: Tensor, action: Tensor, time_step: Tensor | None = None) -> Tensor:
         """The next state for what acts on the system, as :meth:`Task.transition` needs it.

@@ -70,12 +70,12 @@ class ResidualMLP(nn.Module):
                 f"expected one of {sorted(ACTIVATIONS)}, got {activation.__name__!r}.",
             )
         self.network = MLP(
-            in_features=system.observation_dim + system.action_dim,
+            in_features=system.observation_dim + system.acting_dim,
             out_features=len(self.outputs),
             num_cells=list(hidden_sizes),
             activation_class=activation,
         )
-        self.register_buffer("input_scale", torch.ones(system.observation_dim + system.action_dim))
+        self.register_buffer("input_scale", torch.ones(system.observation_dim + system.acting_dim))
         self.register_buffer("output_scale", torch.ones(len(self.outputs)))
 
     @property

@@ -157,9 +157,14 @@ def _play_model(
     An actor alone is four times as fast on the world's tensors as in the TorchRL environment.
     """
     task, generator = world.task, torch.Generator().manual_seed(seed)
-    state = task.sample_start([episodes], generator).to(device)
+    state, outside = task.sample_start([episodes], generator).to(device), task.outside
+    # By a generator of their own, as the first states are.
+    drawn = outside.draw([episodes], task.max_steps + 1, torch.Generator().manual_seed(seed))
+    drawn = {name: values.to(device) for name, values in drawn.items()}
     tally = _Tally(task, episodes, device)
     for step in range(task.max_steps):
+        if outside:
+            state = task.with_signals(state, outside.window(drawn, step))
         tensordict = TensorDict(
             observation=world.observe(state),
             is_init=torch.full([episodes, 1], step == 0, device=device),

@@ -58,6 +58,7 @@ def _read(path: Path) -> Identification:
         constants = {name: Estimate(**each) for name, each in said["constants"].items()}
         actuator = ActuatorEstimate(**{**said["actuator"], "tried": ()})
         stops = {name: (low, high) for name, (low, high) in said["stops"].items()}
+        bounces = {name: Estimate(**each) for name, each in said.get("restitution", {}).items()}
         data: dict[str, Any] = said["data"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(
@@ -75,4 +76,5 @@ def _read(path: Path) -> Identification:
         warnings=(),
         data=data,
         stops=stops,
+        restitution=bounces,
     )

@@ -102,7 +102,7 @@ def loosened_system(system: System, states: Tensor, time: Tensor) -> System:
 
     base: Any = type(system)
 
-    class Loose(base):  # type: ignore[misc]
+    class Loose(base):
         def prior(self, state: Tensor, action: Tensor, constants: Mapping[str, Any]) -> Tensor:
             ahead: Tensor = super().prior(state, action, constants)
             return ahead + added(state, constants)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -13,6 +13,7 @@ from phihp_torchrl.identification.division import Division, spread
 from phihp_torchrl.identification.held_out import BINS, Span, region
 from phihp_torchrl.identification.model import Model
 from phihp_torchrl.identification.parts import HorizonError, Region, Rollout, StateError
+from phihp_torchrl.identification.restitution import RUN_UP, hits
 from phihp_torchrl.identification.shooting import Fit, Shooting, simulate
 from phihp_torchrl.identification.windows import (
     Samples,
@@ -22,12 +23,15 @@ from phihp_torchrl.identification.windows import (
     make_windows,
     runs,
 )
+from phihp_torchrl.integrators import make_integrator
 from phihp_torchrl.recordings import Recording
 
 _PICTURES = 6
 """Predictions of which the samples are kept."""
 _AT_STOPS = 40
 """Stretches at stops that are predicted."""
+_SUBSTEPS = 8
+"""Steps of the integrator between two samples where stops are met."""
 _STRIDE = 5
 """Samples from one prediction to the next."""
 
@@ -83,15 +87,27 @@ def predict(
             first = max(begin, last + 1 - past[1])
             spans.append((first, last + ahead + 1))
             origins.append(last - first)
-    if not spans:
-        return None
+    return _from(model, samples, raw, sigma, spans, origins) if spans else None
+
+
+def _from(
+    model: Model,
+    samples: Samples,
+    raw: Tensor,
+    sigma: Tensor,
+    spans: Sequence[Span],
+    origins: Sequence[int],
+    through: Model | None = None,
+) -> Predictions:
+    """Predict each span after its origin, by the equations ``through`` where those are others."""
     windows, origin = make_windows(samples, spans), torch.tensor(origins)
     known = torch.arange(windows.mask.shape[1]) <= origin[:, None]
     seen = windows._replace(mask=windows.mask & known[..., None])
     starts = first_starts(model.prior.system, seen)
     fit = Shooting(model, samples, seen).fit(sigma, raw, starts, iterations=10, learn=False)
     acting = model.acting(samples, raw)[windows.index]
-    return Predictions(windows, origin, simulate(model, raw, fit.starts, acting, windows))
+    states = simulate(through or model, raw, fit.starts, acting, windows)
+    return Predictions(windows, origin, states)
 
 
 def horizon_error(
@@ -214,11 +230,35 @@ def judge_predictions(
     errors = {h: horizon_error(names, found, fit.sigma, h) for h in division.horizons}
     regions = by_regions(names, found, fit.sigma, ahead)
     rollouts = pictures(names, actions, found, samples, recordings, _PICTURES)
-    whole = runs(samples, torch.ones_like(division.stopped))
-    near = [(a, b) for a, b in cut(whole, ahead + 10, ahead) if division.stopped[a:b].any()]
-    met = predict(*plain, spread(near, _AT_STOPS), whole, past, ahead)
+    met = _at_stops(model, samples, fit, division, past, ahead)
     if met is not None:
         error = horizon_error(names, met, fit.sigma, ahead)
         regions.append(Region("stop", None, None, len(met.origin), error.states))
         rollouts += pictures(names, actions, met, samples, recordings, 2, at_stop=True)
     return Judged({str(h): error for h, error in errors.items()}, regions, rollouts)
+
+
+def _at_stops(
+    model: Model,
+    samples: Samples,
+    fit: Fit,
+    division: Division,
+    past: tuple[int, int],
+    ahead: int,
+) -> Predictions | None:
+    """Predictions through hits of stops, from clear run-ups to them if there are some."""
+    system = model.prior.system
+    spans = [
+        span
+        for name, stop in division.stops.items()
+        for span in hits(samples, system.state_names.index(name), stop, ahead)
+    ]
+    if spans:
+        # A hit falls between two samples.
+        integrator = make_integrator(model.integrator.name, substeps=_SUBSTEPS)
+        fine, few = replace(model, integrator=integrator), spread(spans, _AT_STOPS)
+        return _from(model, samples, fit.raw, fit.sigma, few, [RUN_UP] * len(few), fine)
+    whole = runs(samples, torch.ones_like(division.stopped))
+    near = [(a, b) for a, b in cut(whole, ahead + 10, ahead) if division.stopped[a:b].any()]
+    few = spread(near, _AT_STOPS)
+    return predict(model, samples, fit.raw, fit.sigma, few, whole, past, ahead)

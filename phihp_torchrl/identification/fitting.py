@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -14,7 +15,8 @@ from phihp_torchrl.identification.config import AUTO, IdentifyConfig
 from phihp_torchrl.identification.division import LEAST, TRIAL, Division, divide, spread
 from phihp_torchrl.identification.held_out import Span
 from phihp_torchrl.identification.model import Model
-from phihp_torchrl.identification.parts import ActuatorTrial
+from phihp_torchrl.identification.parts import ActuatorTrial, Estimate
+from phihp_torchrl.identification.restitution import fit_restitution
 from phihp_torchrl.identification.settling import settle
 from phihp_torchrl.identification.shooting import Fit, Shooting
 from phihp_torchrl.identification.stops import check_stops, suspect_stops
@@ -28,6 +30,7 @@ from phihp_torchrl.identification.windows import (
     runs,
 )
 from phihp_torchrl.integrators import make_integrator
+from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import Task
 
 _OUTLYING = 10.0
@@ -48,6 +51,7 @@ class Fitted(NamedTuple):
         outlying: windows that were left out because the equations do not describe them.
         division: which samples were held out and left out.
         found: names of the positions whose stops were found in the data.
+        restitution: how positions leave their stops, by name.
         tried: the paths of the command that were tried.
     """
 
@@ -59,6 +63,7 @@ class Fitted(NamedTuple):
     outlying: int
     division: Division
     found: tuple[str, ...]
+    restitution: dict[str, Estimate]
     tried: tuple[ActuatorTrial, ...]
 
 
@@ -93,7 +98,15 @@ def fit_recordings(task: Task, samples: Samples, config: IdentifyConfig) -> Fitt
     limits = {name: pair for name, pair in division.stops.items() if name in system.velocity_of}
     layout = system.layout(task.velocity_limits, limits, task.restitution)
     stopping = model.stopping(layout, judged.fit.raw)
-    return Fitted(model, stopping, judged.fit, *final, division, tuple(found), chooser.table())
+    bounces = fit_restitution(model, stopping, samples, judged.fit, limits)
+    kept = [bounces[n].estimate if n in bounces else r for n, r in _by_name(system, stopping)]
+    stopping = replace(stopping, layout=replace(stopping.layout, restitution=tuple(kept)))
+    rows = chooser.table()
+    return Fitted(model, stopping, judged.fit, *final, division, tuple(found), bounces, rows)
+
+
+def _by_name(system: System, model: Model) -> Iterable[tuple[str, float]]:
+    return zip(system.velocity_of, model.layout.restitution, strict=True)
 
 
 def _choose(task: Task, samples: Samples, division: Division, config: IdentifyConfig) -> Chooser:

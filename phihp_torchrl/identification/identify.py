@@ -123,6 +123,7 @@ def _report(
         regions=tuple(judged.regions),
         noise={n: float(fit.sigma[system.state_names.index(n)]) for n in names},
         warnings=tuple(warnings),
+        restitution=fitted.restitution,
         stops={n: x for n, x in division.stops.items() if n in system.velocity_of},
         data=_data(task, samples, recordings, fitted),
         rollouts=tuple(judged.rollouts),

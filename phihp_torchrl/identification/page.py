@@ -184,6 +184,9 @@ def _constants(found: Identification) -> str:
     if found.combinations:
         html += "<h3>Combinations of constants</h3>\n"
         html += sections.estimates(found, found.combinations, "Combinations of constants")
+    if found.restitution:
+        caption = "Share of the speed that is left at the stops of a position"
+        html += sections.estimates(found, found.restitution, caption)
     return _said(_ABOUT_CONSTANTS, html)
 
 

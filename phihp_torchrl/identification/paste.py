@@ -52,6 +52,8 @@ def ready_to_paste(task: Task, found: Identification) -> dict[str, str]:
             f'"{name}": ({_rounded(low)}, {_rounded(high)})' for name, (low, high) in new.items()
         )
         given.append(f"position_limits={{{', '.join(pairs)}}},")
+    if told := {n: e.estimate for n, e in found.restitution.items() if e.verdict == IDENTIFIED}:
+        given.append(f"restitution={{{', '.join(f'{n!r}: {v:.3g}' for n, v in told.items())}}},")
     if given:
         lines["Task(...), in Python"] = "\n".join(given)
     return lines

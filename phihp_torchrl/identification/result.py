@@ -39,6 +39,7 @@ class Identification:
         noise: standard deviation of each measured state, in its unit.
         warnings: what must be known; ``str`` of each has the advice with it.
         stops: stops that the task, the settings or the data gave, by the name of the position.
+        restitution: how much of its speed a position keeps at its stops, by name.
         data: counts of samples, stretches and windows, and what was left out, by name.
         rollouts: some held-out predictions.
         residuals: what the fit leaves over.
@@ -71,6 +72,7 @@ class Identification:
     warnings: tuple[Finding, ...]
     data: Mapping[str, Any]
     stops: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    restitution: Mapping[str, Estimate] = field(default_factory=dict)
     rollouts: tuple[Rollout, ...] = ()
     residuals: Residuals | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -126,7 +128,18 @@ class Identification:
             system=system,
             actuator=self.actuator_for(task) or task.actuator,
             position_limits={**self.stops, **task.position_limits},
+            restitution=self._bounces(task),
         )
+
+    def _bounces(self, task: Task) -> float | Mapping[str, float]:
+        """The restitution of the task, with what was identified of it."""
+        told = {n: e.estimate for n, e in self.restitution.items() if e.verdict == IDENTIFIED}
+        if not told:
+            return task.restitution
+        given = task.restitution
+        if not isinstance(given, Mapping):
+            given = {n: given for n in {**self.stops, **task.position_limits}}
+        return {**given, **told}
 
     def actuator_for(self, task: Task) -> Actuator | None:
         """The fitted actuator with its delay in steps of ``task``; ``None`` for a perfect one."""

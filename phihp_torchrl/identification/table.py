@@ -8,7 +8,7 @@ from typing import Any
 
 def lay_out(found: Mapping[str, Any]) -> str:
     """Lines of text for the plain values of an identification."""
-    parts = [_constants(found), _actuator(found["actuator"]), _errors(found)]
+    parts = [_constants(found), _actuator(found["actuator"]), _bounces(found), _errors(found)]
     parts.append("\n".join(f"! {warning}" for warning in found["warnings"]))
     return "\n\n".join(part for part in parts if part)
 
@@ -33,6 +33,14 @@ def _actuator(actuator: Mapping[str, Any]) -> str:
     if len(rows) == 1:
         return "actuator: commands act as they are, and at once"
     return _columns(rows)
+
+
+def _bounces(found: Mapping[str, Any]) -> str:
+    rows = [("stops of", "share of the speed that is left", "95 % interval", "verdict")]
+    for name, e in found["restitution"].items():
+        interval = "–" if e["low"] is None else f"{_n(e['low'])} to {_n(e['high'])}"
+        rows.append((name, _n(e["estimate"]), interval, e["verdict"]))
+    return _columns(rows) if len(rows) > 1 else ""
 
 
 def _errors(found: Mapping[str, Any]) -> str:

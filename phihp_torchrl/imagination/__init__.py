@@ -12,6 +12,7 @@ from phihp_torchrl.imagination.rollouts import (
     step_worlds,
     sum_rewards,
 )
+from phihp_torchrl.imagination.signal_stream import SignalStream
 from phihp_torchrl.imagination.start_states import (
     BoxStates,
     DataStates,
@@ -30,6 +31,7 @@ __all__ = [
     "DataStates",
     "MixtureStates",
     "Rollouts",
+    "SignalStream",
     "StartConfig",
     "StartStates",
     "TaskStates",

@@ -41,6 +41,9 @@ class ChunkNoise(NamedTuple):
     """Uniform actions in physical units, ``[steps, worlds, m]``."""
     use_random: Tensor
     """Whether the random action replaces the policy's, bool ``[steps, worlds]``."""
+    signals: Tensor | None = None
+    """References and inputs after each step, registers ``[steps, worlds, size]``; ``None`` for a
+    task without, and where they go on as the model expects."""
 
 
 def draw_noise(
@@ -50,6 +53,7 @@ def draw_noise(
     std: float,
     random_fraction: float,
     generator: torch.Generator | None = None,
+    signals: Tensor | None = None,
 ) -> ChunkNoise:
     """Draw the noise of a chunk of ``start_states`` ``[steps, worlds, n]``.
 
@@ -59,13 +63,14 @@ def draw_noise(
         std: standard deviation of the noise, in units of the action's half-range.
         random_fraction: share of uniformly random actions, in [0, 1].
         generator: source of randomness.
+        signals: references and inputs after each step, registers ``[steps, worlds, size]``.
     """
     shape = start_states.shape[:-1]
     options: dict[str, Any] = {"generator": generator, "device": start_states.device}
     exploration = std * torch.randn([*shape, bounds.scale.shape[0]], **options)
     uniform = 2.0 * torch.rand([*shape, bounds.scale.shape[0]], **options) - 1.0
     use_random = torch.rand(shape, **options) < random_fraction
-    return ChunkNoise(start_states, exploration, bounds.from_unit(uniform), use_random)
+    return ChunkNoise(start_states, exploration, bounds.from_unit(uniform), use_random, signals)
 
 
 def step_worlds(
@@ -102,10 +107,15 @@ def step_worlds(
         action = bounds.clip(action + noise.exploration[t] * bounds.scale)
         action = torch.where(noise.use_random[t].unsqueeze(-1), noise.random_actions[t], action)
         next_state, reward, terminated = finite_transition(world_model.transition, state, action)
+        start = noise.start_states[t]
+        if noise.signals is not None:  # they are the world's, and go on when a life ends
+            next_state, start = (
+                world_model.task.with_signals(s, noise.signals[t]) for s in (next_state, start)
+            )
         rows.append(Batch(state, action, reward, next_state, terminated))
         age = age + 1
         ended = terminated | (age >= max_age)
-        state = torch.where(ended.unsqueeze(-1), noise.start_states[t], next_state)
+        state = torch.where(ended.unsqueeze(-1), start, next_state)
         age = torch.where(ended, torch.zeros_like(age), age)
     batch = Batch(*(torch.cat(column) for column in zip(*rows, strict=True)))
     return batch, Worlds(state, age)
@@ -135,12 +145,19 @@ def sum_rewards(
     bounds: ActionBounds,
     steps: int,
     gamma: float = 1.0,
+    signals: Tensor | None = None,
 ) -> Returns:
-    """Continue episodes for ``steps`` steps of the noise-free policy, and add their rewards."""
+    """Continue episodes for ``steps`` steps of the noise-free policy, and add their rewards.
+
+    References and inputs after each step are ``signals`` ``[steps, N, size]``, or else as the model
+    expects them.
+    """
     state, total, weight = returns
-    for _ in range(steps):
+    for k in range(steps):
         action = policy(weights, world_model.observe(state), bounds)
         state, reward, terminated = world_model.transition(state, action)
+        if signals is not None:
+            state = world_model.task.with_signals(state, signals[k])
         total = total + weight * reward
         weight = gamma * weight * (1.0 - terminated.to(weight.dtype))
     return Returns(state, total, weight)
@@ -201,7 +218,12 @@ class Rollouts:
         return self._step_worlds(weights, worlds, noise, self.bounds, self.max_age)
 
     def returns(
-        self, weights: Sequence[Tensor], state: Tensor, steps: int, gamma: float = 1.0
+        self,
+        weights: Sequence[Tensor],
+        state: Tensor,
+        steps: int,
+        gamma: float = 1.0,
+        signals: Tensor | None = None,
     ) -> Returns:
         """Sum the rewards of ``steps`` steps of the noise-free policy from each state ``[N, n]``.
 
@@ -210,8 +232,13 @@ class Rollouts:
             state: first states, ``[N, n]``.
             steps: number of steps.
             gamma: discount.
+            signals: references and inputs after each step, registers ``[steps, N, size]``. By
+                default they go on as the model expects.
         """
         returns, size = Returns.from_state(state), self._RETURN_STEPS
-        for _ in range(steps // size):
-            returns = self._sum_rewards_chunk(weights, returns, self.bounds, size, gamma)
-        return self._sum_rewards(weights, returns, self.bounds, steps % size, gamma)
+        whole = steps - steps % size
+        for first in range(0, whole, size):
+            after = None if signals is None else signals[first : first + size]
+            returns = self._sum_rewards_chunk(weights, returns, self.bounds, size, gamma, after)
+        after = None if signals is None else signals[whole:]
+        return self._sum_rewards(weights, returns, self.bounds, steps % size, gamma, after)

@@ -65,7 +65,8 @@ class BoxStates:
 class TaskStates:
     """Start states of a task whose physical components come from another sampler.
 
-    Behind them stand the registers that the task adds, such as commands under way.
+    Behind them stand the registers that the task adds, such as commands under way; references and
+    inputs among them are drawn.
 
     Args:
         task: the task.
@@ -94,10 +95,8 @@ class TaskStates:
         device: torch.device | str | None = None,
     ) -> Tensor:
         states = self.physical.sample(shape, generator, device)
-        if not self.task.register_count:
-            return states
-        if not self.under_way:
-            return self.task.at_rest(states)
+        if not self.under_way or not self.task.register_count:
+            return self.task.at_start(states, generator)
         registers = self.task.random_registers(shape, generator)
         return torch.cat([states, registers.to(states)], -1)
 

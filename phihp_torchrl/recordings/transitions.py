@@ -78,6 +78,12 @@ def observations(task: Task, recording: Recording) -> Tensor:
 
 def _check(task: Task, recordings: Sequence[Recording]) -> None:
     names = task.system.state_names
+    if task.outside:
+        raise ConfigError(
+            "recordings",
+            f"task {task.name!r} has {list(task.outside.signals)}, which a recording does not "
+            "have; learn its model from recordings by a task without.",
+        )
     check_columns(task.system, recordings)
     measured = torch.stack([log.measured for log in recordings]).any(0) if recordings else ()
     if missing := [n for n, known in zip(names, measured, strict=False) if not known]:

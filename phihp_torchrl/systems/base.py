@@ -99,6 +99,8 @@ class System:
     """Components of the state, in order."""
     action_names: ClassVar[tuple[str, ...]]
     """Components of the action, in order."""
+    input_names: ClassVar[tuple[str, ...]] = ()
+    """What acts besides the actions and is measured, such as wind; behind them in ``action``."""
     angles: ClassVar[tuple[str, ...]] = ()
     """State components that live on a circle, in radians; observed as cosine and sine."""
     velocity_of: ClassVar[Mapping[str, str]] = {}
@@ -143,7 +145,7 @@ class System:
 
         Args:
             state: states in the order of :attr:`state_names`.
-            action: actions in physical units.
+            action: actions in physical units, and behind them the inputs if the system has some.
             constants: current values of the constants, by name.
         """
         raise NotImplementedError(f"{type(self).__name__}: this system has no prior.")
@@ -182,6 +184,11 @@ class System:
     def action_dim(self) -> int:
         """Number of action components, ``m``."""
         return len(self.action_names)
+
+    @property
+    def acting_dim(self) -> int:
+        """Number of components that act on the system: its actions and its inputs."""
+        return self.action_dim + len(self.input_names)
 
     @property
     def observation_dim(self) -> int:

@@ -81,6 +81,19 @@ class Part(ABC):
         """What ``command`` costs where a task is imagined, ``[*batch]``; ``None`` for nothing."""
         return None
 
+    def start(self, command: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Registers ``[*batch, size]`` in which an episode starts, by default at rest.
+
+        Args:
+            command: the command before, ``[*batch, m]``.
+            generator: source of randomness.
+        """
+        return self.rest(command)
+
+    def drift(self, registers: Tensor) -> Tensor | None:
+        """What moves the physical state besides, ``[*batch, n]`` per second, or ``None``."""
+        return None
+
     def memory(self, time_step: float) -> float:
         """Seconds after which the commands before have next to no effect on the registers."""
         return 0.0
@@ -120,6 +133,16 @@ class Registers:
     def rest(self, command: Tensor) -> Tensor:
         """The registers after ``command`` ``[*batch, m]`` was held for long."""
         return _joined([part.rest(command) for part in self.parts], command)
+
+    def start(self, command: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Registers in which an episode starts, after ``command`` ``[*batch, m]``."""
+        return _joined([part.start(command, generator) for part in self.parts], command)
+
+    def drift(self, registers: Tensor) -> Tensor | None:
+        """What moves the physical state besides, ``[*batch, n]`` per second, or ``None``."""
+        drifts = [part.drift(value) for part, value in self.split(registers)]
+        known = [drift for drift in drifts if drift is not None]
+        return sum(known[1:], known[0]) if known else None
 
     def random(self, commands: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Registers in the middle of an episode, after ``commands`` ``[*batch, k, m]``."""

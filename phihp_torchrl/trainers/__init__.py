@@ -28,15 +28,10 @@ from phihp_torchrl.trainers.policy_search import PolicySearch
 from phihp_torchrl.trainers.record import record
 from phihp_torchrl.trainers.results import read_controllers, read_result
 from phihp_torchrl.trainers.run import RunResult, run
-from phihp_torchrl.trainers.run_config import (
-    RunConfig,
-    RunRequest,
-    check_run,
-    read_request,
-    read_run_config,
-    task_of,
-)
+from phihp_torchrl.trainers.run_checks import check_run
+from phihp_torchrl.trainers.run_config import RunConfig, task_of
 from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory, write_atomically
+from phihp_torchrl.trainers.run_request import RunRequest, read_request, read_run_config
 from phihp_torchrl.trainers.td3 import RealTD3Config, RealTD3Trainer
 
 __all__ = [

@@ -246,10 +246,7 @@ def _trial(kept: Mapping[str, Any]) -> Trial:
 
 
 def _build(context: Context) -> Phase:
-    parts: dict[str, Any] = {}
-    for phase in context.before.values():
-        parts |= getattr(phase, "parts", dict)()
-    agent = Agent(context.task, **parts, planner_config=context.config.planner)
+    agent = Agent(context.task, **context.parts, planner_config=context.planner)
     return CalibratePhase(
         agent,
         context.settings,

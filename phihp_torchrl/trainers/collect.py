@@ -215,7 +215,7 @@ def planning_policy(
     signal = explore.signal(generator, std=1.0) if explore.config.coloured else None
     aim = explore.planning_task() if explore.config.limits else task
     if config.exploration_reward and task.exploration_reward is not None:
-        aim = replace(aim, reward=task.exploration_reward)
+        aim = replace(aim, reward=task.exploration_reward, exploration_reward=task.reward)
     model = TaskWorldModel(aim, dynamics)
     planner = make_planner(model, None, None, config.planner(), generator=generator)
     scale = noise * task.bounds.scale

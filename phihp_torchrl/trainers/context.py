@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+from phihp_torchrl.planners import SearchConfig
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory
@@ -40,3 +41,20 @@ class Context:
     world: World
     before: Mapping[str, Any]
     directory: RunDirectory
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """What the earlier phases made, as arguments of :class:`~phihp_torchrl.Agent`."""
+        parts: dict[str, Any] = {}
+        for phase in self.before.values():
+            parts |= getattr(phase, "parts", dict)()
+        return parts
+
+    @property
+    def planner(self) -> SearchConfig | None:
+        """Settings of the planner, with what phases had to change, such as the critics' discount."""
+        planner = self.config.planner
+        changes: dict[str, Any] = {}
+        for phase in self.before.values():
+            changes |= getattr(phase, "planner_changes", {})
+        return planner if planner is None or not changes else replace(planner, **changes)

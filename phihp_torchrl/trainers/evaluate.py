@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,6 @@ from phihp_torchrl.evaluation import (
     play_baselines,
     show_episode,
 )
-from phihp_torchrl.planners import SearchConfig
 from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
@@ -215,22 +214,11 @@ def _public(config: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in config.items() if key not in private}
 
 
-def _planner(context: Context) -> SearchConfig | None:
-    """Settings of the planner, with what phases had to change, such as the critics' discount."""
-    planner = context.config.planner
-    changes: dict[str, Any] = {}
-    for phase in context.before.values():
-        changes |= getattr(phase, "planner_changes", {})
-    return planner if planner is None or not changes else replace(planner, **changes)
-
-
 def _build(context: Context) -> Phase:
-    parts: dict[str, Any] = {}
-    for phase in context.before.values():
-        parts |= getattr(phase, "parts", dict)()
+    parts = context.parts
     config, agent = context.config, parts.get("agent")
     if agent is None:
-        parts = {"planner_config": _planner(context), "compile": config.compile, **parts}
+        parts = {"planner_config": context.planner, "compile": config.compile, **parts}
         agent = Agent(context.task, **parts)
     world, samples = context.world, real_steps(context.before)
     collect = getattr(config.sections.get("model"), "collect", None)

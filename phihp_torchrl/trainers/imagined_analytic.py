@@ -22,7 +22,8 @@ class ImaginedAnalytic(ReplayTrainer):
     """Learns by the gradients of imagined returns through the model.
 
     All worlds go on from one update to the next; those that have reached the largest age start
-    anew between two of them. The transitions are kept for the fit of the critics to returns.
+        anew between two of them. References and inputs stay during an episode as they were at its
+    start. The transitions are kept for the fit of the critics to returns.
 
     Args:
         imagination: model, rollouts, start states and settings.

@@ -23,7 +23,7 @@ class ImaginedTD3(TD3Trainer):
             imagination.world_model, config.td3, seed=imagination.seed, compile=imagination.compile
         )
         self.replay = imagination.new_replay()
-        self.worlds = imagination.new_worlds(self.generator)
+        self.enter(imagination.new_worlds(self.generator))
 
     @property
     def imagined_steps(self) -> int:

@@ -31,12 +31,14 @@ class Learner(Protocol):
         (0, 0)
     """
 
-    update: ActorCriticUpdate
-    """Actor and critics, which the learner changes in place."""
     updates: int
     """Critic updates so far."""
     generator: torch.Generator
     """Source of all random numbers but the initial weights."""
+
+    @property
+    def update(self) -> ActorCriticUpdate:
+        """Actor and critics, which the learner changes in place."""
 
     @property
     def imagined_steps(self) -> int:

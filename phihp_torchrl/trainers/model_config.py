@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import nn
@@ -144,6 +144,12 @@ class ModelConfig:
     def iterations(self) -> int:
         """Number of fits."""
         return -(-self.real_steps // self.period)
+
+    @property
+    def refit(self) -> FitConfig:
+        """Settings of a fit that goes on from the one before: fewer steps, from the last λ on."""
+        steps = min(self.fit.steps, self.refit_steps)
+        return replace(self.fit, steps=steps, initial_lambda=self.fit.final_lambda)
 
 
 def make_dynamics(

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from phihp_torchrl.agents import Layers, Scales, act, scaled
 from phihp_torchrl.imagination import Rollouts
+from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.worlds import World
 
@@ -41,6 +42,7 @@ class ActorEvaluation:
         self.rollouts, self.scales = rollouts, scales
         self.steps = config.evaluation_steps or task.max_steps
         self.states = task.sample_start([config.evaluation_episodes], generator)
+        self.signals = self._draw_signals(task, config.evaluation_episodes, seed)
         truth = None if world is None or not config.real_evaluation_episodes else world.model()
         self.world = None
         if truth is not None:
@@ -50,17 +52,32 @@ class ActorEvaluation:
         self.world_states = task.sample_start(
             [config.real_evaluation_episodes], torch.Generator().manual_seed(seed)
         )
+        self.world_signals = self._draw_signals(task, config.real_evaluation_episodes, seed)
 
     def imagined(self, actor: Layers) -> float:
         """Mean return in the model; minus infinity where the actor left the finite numbers."""
-        return self._play(self.rollouts, actor, self.states)
+        return self._play(self.rollouts, actor, self.states, self.signals)
 
     def real(self, actor: Layers) -> dict[str, float]:
         """Mean return in the simulated world, to log; nothing without one."""
         if self.world is None:
             return {}
-        return {"policy/real_return": self._play(self.world, actor, self.world_states)}
+        score = self._play(self.world, actor, self.world_states, self.world_signals)
+        return {"policy/real_return": score}
 
-    def _play(self, world: Rollouts, actor: Layers, states: Tensor) -> float:
-        score = world.returns(actor, states, self.steps).total
+    def _draw_signals(self, task: Task, episodes: int, seed: int) -> Tensor | None:
+        """References and inputs of episodes, ``[1 + steps, episodes, size]``, if there are any."""
+        if not task.outside:
+            return None
+        generator, steps = torch.Generator().manual_seed(seed), 1 + self.steps
+        drawn = task.outside.draw([episodes], steps, generator)
+        return task.outside.windows(drawn, 0, steps)
+
+    def _play(
+        self, world: Rollouts, actor: Layers, states: Tensor, signals: Tensor | None
+    ) -> float:
+        later = None
+        if signals is not None:
+            states, later = world.task.with_signals(states, signals[0]), signals[1:]
+        score = world.returns(actor, states, self.steps, signals=later).total
         return self.scales.reward * torch.nan_to_num(score, nan=-math.inf).mean().item()

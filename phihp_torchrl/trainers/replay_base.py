@@ -8,14 +8,14 @@ from typing import Any
 import torch
 
 from phihp_torchrl.agents import ActorCriticUpdate, FlatReplay
-from phihp_torchrl.imagination import Worlds
+from phihp_torchrl.imagination import SignalStream, Worlds
 from phihp_torchrl.tasks import Task
 
 
 class ReplayTrainer:
     """The base of trainers that step worlds, keep their transitions and update actor and critics.
 
-    Subclasses set :attr:`update`, :attr:`replay` and :attr:`worlds`.
+    Subclasses set :attr:`update` and :attr:`replay`, and :meth:`enter` worlds.
 
     Args:
         task: the task.
@@ -31,6 +31,16 @@ class ReplayTrainer:
         self.task = task
         self.generator = torch.Generator().manual_seed(seed)
         self.updates = 0
+        self.stream: SignalStream | None = None
+        """References and inputs of the worlds, for a task that has some."""
+
+    def enter(self, worlds: Worlds) -> None:
+        """Take these worlds, with references and inputs of their own."""
+        self.worlds = worlds
+        if self.task.outside:
+            self.stream = SignalStream(self.task, len(worlds.age), self.generator)
+            state = self.task.with_signals(worlds.state, self.stream.present())
+            self.worlds = worlds._replace(state=state)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
@@ -40,6 +50,7 @@ class ReplayTrainer:
             "worlds": list(self.worlds),
             "updates": self.updates,
             "generator": self.generator.get_state(),
+            **({} if self.stream is None else {"signals": self.stream.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -49,3 +60,5 @@ class ReplayTrainer:
         self.worlds = Worlds(*state["worlds"])
         self.updates = state["updates"]
         self.generator.set_state(state["generator"])
+        if self.stream is not None:
+            self.stream.load_state_dict(state["signals"])

@@ -28,7 +28,8 @@ from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.interrupt import Interrupt
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
 from phihp_torchrl.trainers.phases import PHASES, Phase, real_steps
-from phihp_torchrl.trainers.run_config import RunConfig, check_run, task_of
+from phihp_torchrl.trainers.run_checks import check_run
+from phihp_torchrl.trainers.run_config import RunConfig, task_of
 from phihp_torchrl.trainers.run_directory import MetricsTable, RunDirectory
 from phihp_torchrl.trainers.start import check_same, start_directory
 from phihp_torchrl.worlds import World, make_world

@@ -1,25 +1,17 @@
-"""The settings of a run as dataclasses, and their reading from YAML and command lines."""
+"""The settings of a run as a dataclass, and the task that they name."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from phihp_torchrl.config import (
-    METHODS,
-    PLACES,
     ConfigError,
     Method,
-    apply_overrides,
     check_count,
     check_not_negative,
-    finish,
-    from_mapping,
     get_method,
-    override_key,
-    parse_overrides,
-    resolve_seconds,
     to_mapping,
 )
 from phihp_torchrl.evaluation import check_training_seed
@@ -27,11 +19,7 @@ from phihp_torchrl.planners import PLANNERS, CEMConfig, SearchConfig
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.trainers.loggers import LoggerConfig
 from phihp_torchrl.trainers.phases import PHASES, unknown_phases
-from phihp_torchrl.trainers.plugins import import_plugins
-from phihp_torchrl.trainers.policy_config import PolicyConfig
-from phihp_torchrl.trainers.run_directory import RunDirectory
-from phihp_torchrl.trainers.strategies import strategies_of
-from phihp_torchrl.worlds import WORLDS, SimulatedConfig, World
+from phihp_torchrl.worlds import WORLDS, SimulatedConfig
 
 FREE_KEYS = ("checkpoint_interval", "keep_checkpoints", "progress", "logger")
 """Settings that a resumed run may change, because they do not affect its results."""
@@ -79,6 +67,7 @@ class RunConfig:
 
     Examples:
         >>> from phihp_torchrl import load_config
+        >>> from phihp_torchrl.trainers import read_run_config
         >>> config = read_run_config(load_config("pendulum", overrides=["policy.updates=100"]))
         >>> config.section("policy").updates, config.phases
         (100, ('model', 'policy', 'evaluate'))
@@ -214,91 +203,6 @@ def is_enabled(section: Any) -> bool:
     return getattr(section, "enabled", True)
 
 
-@dataclass(frozen=True)
-class RunRequest:
-    """The run that a command line describes.
-
-    Args:
-        config: settings of the run.
-        path: directory of the run; ``None`` for a new one.
-        resume: whether to resume the run in that directory.
-    """
-
-    config: RunConfig
-    path: str | None
-    resume: bool
-
-
-def read_request(composed: Any, overrides: Sequence[str]) -> RunRequest:
-    """Read the settings that Hydra composed as a typed request, and import their plugins.
-
-    Args:
-        composed: the composed settings.
-        overrides: the command line.
-
-    Raises:
-        ConfigError: for the first key that is unknown or has a wrong value, by its dotted name.
-    """
-    keys = [override_key(line) for line in parse_overrides(overrides)]
-    settings = finish(composed, overrides)
-    places = {key: settings.pop(key, None) for key in PLACES}
-    for key, value in places.items():
-        if value is not None and not isinstance(value, str):
-            raise ConfigError(key, f"expected a directory, got {value!r}.")
-    if places["resume"] is not None:
-        if places["run_dir"] is not None:
-            raise ConfigError("run_dir", "expected none with resume, which names the directory.")
-        kept = RunDirectory(places["resume"]).read_config()
-        if "logger" in keys:
-            kept["logger"] = settings["logger"]
-        given = [line for line, key in zip(overrides, keys, strict=False) if key not in PLACES]
-        settings = apply_overrides(kept, given)
-    config = read_run_config(settings, given=keys)
-    path = places["resume"] or places["run_dir"]
-    return RunRequest(config, path, resume=places["resume"] is not None)
-
-
-def read_run_config(settings: Mapping[str, Any], given: Sequence[str] = ()) -> RunConfig:
-    """Read plain settings as a :class:`RunConfig`, and import the plugins that they name.
-
-    Args:
-        settings: plain values by key, as :func:`~phihp_torchrl.load_config` returns them.
-        given: keys that were set explicitly, which the method must use.
-
-    Raises:
-        ConfigError: for a key that is unknown or missing, or has a wrong value; the message has its
-            dotted name.
-
-    Examples:
-        >>> read_run_config({"task": "acrobot", "method": "td3", "td3": {"seed_steps": 5}})
-        Traceback (most recent call last):
-        ...
-        phihp_torchrl.config.ConfigError: td3.seed_steps: unknown key; did you mean 'real_steps'?
-    """
-    rest = {key: value for key, value in settings.items() if key not in (*PLACES, "presets")}
-    import_plugins(rest.get("plugins") or ())
-    method_name = rest.get("method", "phihp")
-    method = METHODS.find(method_name)
-    unknown_phases(method.phases)  # those of the package's own have settings from now on
-    used = method.sections
-    known = {*PHASES, *(name for each in METHODS.values() for name in each.phases), "planner"}
-    sections = {}
-    for name in sorted(known & set(rest)):
-        if name not in used:
-            rest.pop(name)
-            if keys := [key for key in given if key.split(".")[0] == name]:
-                raise ConfigError(
-                    keys[0],
-                    f"method {method_name!r} has no use for {name!r}; "
-                    f"its sections are {list(used)}.",
-                )
-        elif name in PHASES:
-            sections[name] = from_mapping(PHASES[name].config, rest.pop(name), name)
-    if "sections" in rest:
-        raise ConfigError("sections", "unknown key; phases are set by their own names.")
-    return from_mapping(RunConfig, {**rest, "sections": sections})
-
-
 def task_of(config: RunConfig, task: Task | None = None) -> Task:
     """Return the task of a run, with the actuator and the rates that its settings give it.
 
@@ -311,6 +215,7 @@ def task_of(config: RunConfig, task: Task | None = None) -> Task:
 
     Examples:
         >>> from phihp_torchrl import load_config
+        >>> from phihp_torchrl.trainers import read_run_config
         >>> settings = load_config("pendulum", overrides=["actuator.delay_steps=2"])
         >>> task_of(read_run_config(settings)).state_dim  # two commands wait
         4
@@ -325,70 +230,3 @@ def task_of(config: RunConfig, task: Task | None = None) -> Task:
     rates = {name: value for name in names if (value := getattr(config, name)) is not None}
     task = task.with_actuator(config.actuator)
     return replace(task, **rates) if rates else task
-
-
-def check_run(config: RunConfig, world: World) -> None:
-    """Refuse settings that the task or the world of a run cannot serve, before any real step.
-
-    Raises:
-        ConfigError: if the system has no prior or the world is not simulated, where one is needed,
-            for constants to draw where none are learned, and for seconds that are too few for a
-            step of the task or do not fit other settings.
-    """
-    task = world.task
-    for name, section in {**config.sections, "planner": config.planner}.items():
-        if section is not None:
-            try:
-                resolve_seconds(section, task.time_step)
-            except ConfigError as error:
-                raise error.inside(name) from error
-    kind = getattr(config.sections.get("model"), "kind", None)
-    if kind in ("hybrid", "prior") and not task.system.has_prior:
-        raise ConfigError(
-            "model.kind",
-            f"method {config.method!r} with a model of kind {kind!r} needs a prior, and the system "
-            f"of task {task.name!r}, {type(task.system).__name__}, has none; expected "
-            "'data_driven' or a method that needs none.",
-        )
-    if not world.has_env:
-        phases = [name for name in config.phases_to_do if PHASES[name].needs_env]
-        if phases:
-            raise ConfigError(
-                "method",
-                f"expected one that does without acting in the world, {config.method!r} acts in it "
-                f"in {phases}, and {world} has recordings alone.",
-            )
-    if isinstance(policy := config.sections.get("policy"), PolicyConfig):
-        strategies_of(policy)  # refuses unknown ones
-    if getattr(config.sections.get("policy"), "draw_constants", False):
-        _check_drawing(config, task)
-    if world.truth is None:
-        phases = [name for name in config.phases_to_do if PHASES[name].needs_truth]
-        if phases:
-            raise ConfigError(
-                "method",
-                f"expected one that does without a simulated world, {config.method!r} needs one "
-                f"for {phases}, and {world} is none.",
-            )
-        if kind == "oracle":
-            raise ConfigError(
-                "model.kind", f"expected another than 'oracle': {world} has no truth to plan with."
-            )
-
-
-def _check_drawing(config: RunConfig, task: Task) -> None:
-    """Refuse to draw constants where none are learned, or their fit gives no covariance."""
-    model = config.section("model")
-    learned = [name for name, c in task.system.ranges.items() if not c.fixed]
-    if model.kind not in ("hybrid", "prior") or not learned:
-        raise ConfigError(
-            "policy.draw_constants",
-            f"expected false for a model of kind {model.kind!r} of a system that has "
-            f"{len(learned)} constants to learn: there are none to draw.",
-        )
-    if not model.has_fixed_steps and config.section("policy").constants_std is None:
-        raise ConfigError(
-            "policy.constants_std",
-            f"expected a number with draw_constants=true and model.integrator={model.integrator}, "
-            "whose fit has no covariance.",
-        )

@@ -9,8 +9,9 @@ from typing import Any
 
 from phihp_torchrl.config import ConfigError, differences, get_method
 from phihp_torchrl.trainers.checkpoints import load_state
-from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig, is_enabled, read_run_config
+from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig, is_enabled
 from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
+from phihp_torchrl.trainers.run_request import read_run_config
 
 _log = logging.getLogger(__name__)
 

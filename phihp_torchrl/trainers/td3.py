@@ -168,7 +168,7 @@ class RealTD3Trainer(TD3Trainer):
             self.replay.extend(transitions)
         self.given = given
         first = task.sample_start([1], self.generator)
-        self.worlds = Worlds(first, torch.zeros(1, dtype=torch.int64))
+        self.enter(Worlds(first, torch.zeros(1, dtype=torch.int64)))
         # Evaluations have a generator of their own: the log has no part in the training.
         self._evaluation_states = task.sample_start(
             [config.evaluation_episodes], torch.Generator().manual_seed(seed)

@@ -27,8 +27,8 @@ class TD3Trainer(ReplayTrainer):
         self, world_model: TaskWorldModel, td3: TD3Config, *, seed: int, compile: bool
     ) -> None:
         super().__init__(world_model.task, seed)
-        loss = make_td3_loss(world_model, td3)
-        self.update = TD3Update(loss, world_model, td3, compile=compile)
+        self.loss = make_td3_loss(world_model, td3)
+        self.update = TD3Update(self.loss, world_model, td3, compile=compile)
 
     def _act(
         self, world: Rollouts, starts: Tensor, *, noise: float, random_fraction: float
@@ -47,6 +47,7 @@ class TD3Trainer(ReplayTrainer):
             std=noise,
             random_fraction=random_fraction,
             generator=self.generator,
+            signals=None if self.stream is None else self.stream.advance(len(starts)),
         )
         batch, self.worlds = world.chunk(self.update.networks.actor, self.worlds, drawn)
         self.replay.extend(batch)

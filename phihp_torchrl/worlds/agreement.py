@@ -39,8 +39,8 @@ def disagreements(task: Task, data: TensorDictBase) -> list[str]:
         >>> disagreements(task, data)[0][:67]
         'the world ended 1 of 4 steps after which the task says it goes on, '
     """
-    state, registers = task.split(task.locate(data["observation"]))
-    next_state, _ = task.split(task.locate(data["next", "observation"]))
+    state = task.locate(data["observation"])
+    next_state = task.locate(data["next", "observation"])
     ours = task.is_terminated(next_state)
     theirs = data["next", "terminated"].reshape(-1)
     found = []
@@ -54,7 +54,8 @@ def disagreements(task: Task, data: TensorDictBase) -> list[str]:
             f"the world went on after {late} of {len(theirs)} steps that the task says are the "
             "last, so imagined lives will be shorter than real ones"
         )
-    expected = task.reward(state, task.command(registers, data["action"]), next_state)
+    command = task.command(task.split(state)[1], data["action"])
+    expected = task.earned(state, command, next_state)
     given = data["next", "reward"].reshape(-1)
     difference = (given - expected).abs().mean().item()
     spread = torch.cat([given, expected]).std(correction=0).item()

@@ -23,6 +23,7 @@ from phihp_torchrl.config import ConfigError, import_named
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.command_memory import command_memory
+from phihp_torchrl.worlds.signal_source import signal_source
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,7 @@ def fit_env(task: Task, env: EnvBase) -> EnvBase:
         transforms.append(DoubleToFloat(in_keys=doubles))
     if "step_count" not in env.observation_spec.keys():  # noqa: SIM118 (a spec, no dictionary)
         transforms.append(StepCounter(max_steps=task.max_steps))
+    transforms += signal_source(task, env)
     if env.observation_spec["observation"].shape[-1] != task.observation_dim:
         transforms += command_memory(task)
     return TransformedEnv(env, Compose(*transforms)) if transforms else env
@@ -174,8 +176,8 @@ def _check_observation(task: Task, env: EnvBase) -> None:
     if spec is None:
         keys = [str(key) for key in env.observation_spec.keys(True, True)]
         raise ConfigError("world", f"expected {expected}, it has {keys}.")
-    # An environment that shows what is under way by itself is right too.
-    shapes = [(size,), (task.observation_dim,)]
+    # An environment that shows signals, or all that is under way, by itself is right too.
+    shapes = [(size,), (task.shown_dim,), (task.observation_dim,)]
     if spec.shape not in shapes or not spec.dtype.is_floating_point:
         raise ConfigError(
             "world", f"expected {expected}, got {spec.dtype} of shape {list(spec.shape)}."

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,6 +11,7 @@ from tensordict.nn import TensorDictModule
 
 from phihp_torchrl import ConfigError, HybridDynamics, get_task
 from phihp_torchrl.baselines import BASELINES, make_baselines, register_baseline
+from phihp_torchrl.tasks import Actuator, Disturbance, Signal, Task
 
 EXPECTED = {
     "pendulum": {"lqr", "pid", "energy"},
@@ -27,6 +30,32 @@ def test_the_quick_ones_that_apply(name: str) -> None:
         action = controller(TensorDict(observation=observation, batch_size=[2, 3]))["action"]
         assert action.shape == (2, 3, task.action_dim)
         torch.testing.assert_close(action, task.clip_action(action))
+
+
+def following(state, action, next_state, reference):
+    return -(state[..., 0] - reference[..., 0]).square()
+
+
+EXTRAS = {
+    "price": ({"action_rate_cost": 0.1}, {"lqr", "pid", "energy"}),
+    "rate": ({"action_rate_limit": 10.0, "actuator": Actuator(delay_steps=1.0)},
+             {"lqr", "pid", "energy"}),
+    "disturbance": ({"disturbance": Disturbance({"theta_dot": 1.0})}, {"lqr", "pid", "energy"}),
+    "reference": ({"reference": Signal(("theta",), (-1.0,), (1.0,)), "reward": following},
+                  {"energy"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_those_of_a_task_with_more_in_its_state(extra: str) -> None:
+    options, expected = EXTRAS[extra]
+    task: Task = replace(get_task("pendulum"), **options)
+    found = make_baselines(task, HybridDynamics.pure_prior(task))
+    assert found.keys() == expected
+    observation = task.observe(task.sample_start([2]))
+    for controller in found.values():
+        action = controller(TensorDict(observation=observation, batch_size=[2]))["action"]
+        assert action.shape == (2, 1)
 
 
 def test_named_ones_only() -> None:

@@ -79,10 +79,11 @@ def record(
     high: float = 5.0,
     step: float = 0.02,
     stop: float = math.inf,
+    bounce: float = 0.0,
     jitter: float = 0.0,
     seed: int = 0,
 ) -> Recording:
-    """Simulate steps of a random command that is held; a stop takes the speed of what meets it."""
+    """Simulate steps of a random command that is held; a stop leaves a share of its speed."""
     generator = torch.Generator().manual_seed(seed)
     draw = torch.rand(samples // hold + 1, 1, generator=generator, dtype=torch.float64)
     command = (high * (2.0 * draw - 1.0)).repeat_interleave(hold, 0)[:samples]
@@ -105,7 +106,7 @@ def record(
                 layout,
             )
             if abs(float(state[0])) > stop:
-                state = torch.stack([state[0].clamp(-stop, stop), torch.zeros_like(state[0])])
+                state = torch.stack([state[0].clamp(-stop, stop), -bounce * state[1]])
     measured = torch.stack(states)
     level = torch.tensor([0.0 if x != x else x for x in noise], dtype=torch.float64)
     measured += level * torch.randn(measured.shape, generator=generator, dtype=torch.float64)

@@ -12,7 +12,7 @@ import torch
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.identification import Identification, IdentifyConfig, identify
 from phihp_torchrl.identification.diagnostics import of_errors
-from phihp_torchrl.identification.parts import HorizonError, StateError
+from phihp_torchrl.identification.parts import IDENTIFIED, HorizonError, StateError
 from phihp_torchrl.integrators import make_integrator
 from phihp_torchrl.recordings import Recording
 from phihp_torchrl.tasks import Actuator
@@ -143,6 +143,19 @@ def test_stops_are_found_left_out_and_given_to_the_task() -> None:
     stop = next(region for region in found.regions if region.state == "stop")
     assert stop.errors["x"].rmse < 0.05
     assert found.task(make_task(Mass())).position_limits["x"] == found.stops["x"]
+
+
+def test_the_speed_that_a_stop_leaves_is_found_and_given_to_the_task() -> None:
+    log = record(Mass(), MASS, stop=0.5, bounce=0.4, noise=(1e-3, UNSEEN), samples=1500)
+    found = identify(make_task(Mass()), [log], IdentifyConfig(**PLAIN))
+    bounce = found.restitution["x"]
+    assert bounce.verdict == IDENTIFIED
+    assert bounce.low <= 0.4 <= bounce.high
+    assert bounce.high - bounce.low < 0.1
+    stop = next(region for region in found.regions if region.state == "stop")
+    assert stop.errors["x"].share < 0.1
+    assert found.task(make_task(Mass())).restitution == {"x": bounce.estimate}
+    assert "stops of" in found.table()
 
 
 def test_outliers_do_not_bias() -> None:

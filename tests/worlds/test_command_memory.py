@@ -58,7 +58,7 @@ def test_the_memory_of_a_batch_is_reset_row_by_row(task):
     agent = Agent(task, actor=Actor(task))
     shown = task.system.observe(torch.zeros(2, 2))
     agent(TensorDict(observation=shown, is_init=torch.ones(2, 1).bool(), batch_size=[2]))
-    agent._memory._registers = torch.ones(2, task.register_count)
+    agent._memory._state = torch.ones(2, task.state_dim)
     starts = torch.tensor([[True], [False]])
     seen = agent._memory.extend(TensorDict(observation=shown, is_init=starts, batch_size=[2]))
     registers = seen["observation"][:, task.system.observation_dim :]

@@ -21,11 +21,13 @@ from phihp_torchrl.worlds.simulated.plant import Plant, find_plant
 class TaskEnv(gym.Env[Any, Any]):
     """The simulated world of a task as a gymnasium environment.
 
-    Observations are those of the system, in float32, without what is under way in an actuator;
-    actions are in physical units and brought within their bounds and rate, the arithmetic is in
-    float64. Rewards are those of the task, without prices. Episodes end where the task terminates
-    them; ``gymnasium.make`` applies ``task.max_steps`` by a ``TimeLimit``. Subclasses for the
-    paper's systems inherit rendering from gymnasium's environments.
+    Observations are those of the system, in float32, without what is under way in an actuator.
+    Behind them are the task's references and inputs with their previews, as :meth:`Task.observe`
+    has them; ``info`` has their present values by name. Actions are in physical units and brought
+    within their bounds and rate, the arithmetic is in float64. Rewards are those of the task,
+    without prices. Episodes end where the task terminates them; ``gymnasium.make`` applies
+    ``task.max_steps`` by a ``TimeLimit``. Subclasses for the paper's systems inherit rendering from
+    gymnasium's environments.
 
     Args:
         task: a :class:`~phihp_torchrl.tasks.Task` or the name of a registered one.
@@ -89,20 +91,44 @@ class TaskEnv(gym.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start an episode from the task's reset box, or from ``options={"state": ...}``."""
+        """Start an episode from the task's reset box, or from ``options={"state": ...}``.
+
+        References and inputs are drawn by the task's samplers, or taken from ``options``:
+        ``options={"reference": ...}`` is a value ``[k]`` that stays, or a trajectory ``[T, k]``
+        from the first step on, whose last value stays.
+        """
         # Not super(): in a subclass that would be gymnasium's own environment, which draws a state.
         gym.Env.reset(self, seed=seed)
         options = options or {}
-        if unknown := sorted(set(options) - {"state"}):
-            raise ValueError(f"options: unknown {unknown}, expected at most ['state'].")
+        if unknown := sorted(set(options) - (known := {"state", *self.task.outside.signals})):
+            raise ValueError(f"options: unknown {unknown}, expected at most {sorted(known)}.")
         box = self.task.reset
         self.state = options.get("state", self.np_random.uniform(box.low, box.high))
         state = self.task.at_rest(torch.from_numpy(self._state))
         self._registers = self.task.split(state)[1]
+        self._start_signals(options)
         self.last_action = None
         if self.render_mode == "human":
             self.render()
-        return self._observe(torch.from_numpy(self._state)), {}
+        return self._observe(torch.from_numpy(self._state)), self._info()
+
+    def _start_signals(self, options: dict[str, Any]) -> None:
+        """Draw the references and inputs of an episode, or take those of the caller."""
+        self._time, outside = 0, self.task.outside
+        if not outside:
+            return
+        generator = torch.Generator().manual_seed(int(self.np_random.integers(2**31)))
+        drawn = outside.draw([], self.task.max_steps + 1, generator)
+        for name, signal in outside.signals.items():
+            if options.get(name) is not None:
+                given = torch.as_tensor(np.asarray(options[name], dtype=np.float64))
+                drawn[name] = _as_trajectory(name, given, signal.size)
+        self._trajectory = drawn
+        self._registers = outside.replaced(self._registers, outside.window(drawn, 0))
+
+    def _info(self) -> dict[str, Any]:
+        """The present references and inputs by their keys, float64 ``[k]``."""
+        return {k: v.numpy() for k, v in self.task.outside.values(self._registers).items()}
 
     def step(
         self, action: ArrayLike
@@ -115,14 +141,18 @@ class TaskEnv(gym.Env[Any, Any]):
             state = torch.cat([torch.from_numpy(self._state), self._registers])
             next_state, reward, terminated = self.task.transition(self._move, state, wanted)
             moved, self._registers = self.task.split(next_state)
+            if outside := self.task.outside:
+                self._time += 1
+                window = outside.window(self._trajectory, self._time)
+                self._registers = outside.replaced(self._registers, window)
             observation = self._observe(moved)
         self.state = moved.numpy()
         if self.render_mode == "human":
             self.render()
-        return observation, float(reward), bool(terminated), False, {}
+        return observation, float(reward), bool(terminated), False, self._info()
 
     def _move(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        self.last_action = action.numpy()
+        self.last_action = action[: self.task.action_dim].numpy()
         return self.integrator(
             lambda s: self.plant.derivative(s, action), state, self.task.time_step, self.layout
         )
@@ -131,7 +161,10 @@ class TaskEnv(gym.Env[Any, Any]):
         if self.noise.any():
             drawn = self.np_random.standard_normal(len(self.noise))
             state = state + torch.from_numpy(self.noise * drawn)
-        return cast(NDArray[np.float32], self.task.system.observe(state).float().numpy())
+        shown = self.task.system.observe(state)
+        if self.task.outside:
+            shown = self.task.complete(shown, self._registers)[: self.task.shown_dim]
+        return cast(NDArray[np.float32], shown.float().numpy())
 
     def _checked_state(self, value: ArrayLike) -> NDArray[np.float64]:
         names = self.task.system.state_names
@@ -164,6 +197,17 @@ def _checked(what: str, value: ArrayLike, size: int, expected: str) -> NDArray[n
     return array.astype(np.float64)
 
 
+def _as_trajectory(name: str, given: torch.Tensor, size: int) -> torch.Tensor:
+    """A trajectory ``[T, k]`` from one that a caller gives, or from a value ``[k]`` that stays."""
+    rows = given.reshape(1, -1) if given.ndim == 1 else given
+    if rows.ndim != 2 or rows.shape[-1] != size or not len(rows) or not rows.isfinite().all():
+        raise ValueError(
+            f"options.{name}: expected finite values of shape [{size}] or [T, {size}], "
+            f"got shape {list(given.shape)}: {given.tolist()}."
+        )
+    return rows
+
+
 def _action_space(task: Task) -> gym.spaces.Box:
     low, high = (np.array(limit, dtype=np.float32) for limit in (task.action_low, task.action_high))
     return gym.spaces.Box(low, high, dtype=np.float32)
@@ -176,5 +220,6 @@ def _observation_space(task: Task) -> gym.spaces.Box:
     for i in range(task.system.state_dim):
         free = limits.get(i, (-np.inf, np.inf))
         bounds += [(-1.0, 1.0)] * 2 if i in task.system.angle_indices else [free]
+    bounds += [(-np.inf, np.inf)] * task.outside.size  # a caller may give any
     low, high = np.array(bounds, dtype=np.float32).T
     return gym.spaces.Box(low, high, dtype=np.float32)

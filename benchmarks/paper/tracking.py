@@ -1,0 +1,285 @@
+"""A motor's speed on a random reference: agents beside a PI controller that was tuned for it.
+
+    python benchmarks/paper/tracking.py --seeds 100 101
+
+Learns ``rigs/motor.py`` for each seed and each preview, from real steps of its simulated world. The
+PI controller, with a clamped integral, is tuned in that same world on an episode seed below 100,
+once for the least RMS error and once for the highest return, which counts small errors more. All
+are then measured on episodes from 1,000,000 on: in the world as it is, with a constant torque of
+the load, and with another inertia, none of which anybody is told. Writes results/tracking/.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from scipy.optimize import minimize
+from tensordict import TensorDict
+from torch import Tensor
+
+from phihp_torchrl import Task, get_task, learn
+from phihp_torchrl.evaluation import EVALUATION_SEED, markdown_table
+from phihp_torchrl.origin import commit_text, describe_origin, machine_text
+from phihp_torchrl.trainers import import_plugins
+from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
+
+RIGS = Path(__file__).parent / "rigs"
+RESULTS = Path("results/tracking")
+TASKS = ("motor", "motor-preview")
+TUNING_SEED = 0
+STEADY_STEPS = 150
+"""Steps for which a constant reference is held; the last 50 of them count."""
+WORLDS = {
+    "as it is": {},
+    "load of 0.2 Nm": {"friction": {"load": 0.2}},
+    "inertia 1.5 times": {"constants": {"inertia": 0.015}},
+}
+SETTINGS = {
+    "model.real_steps": 1000,
+    "model.steps_per_iteration": 500,
+    "policy.evaluation_steps": 250,
+    "policy.real_evaluation_episodes": 0,
+    "policy.refit.start": 0,
+    "evaluate.episodes": 2,
+    "evaluate.latency_actions": 0,
+    "evaluate.video": False,
+    "progress": False,
+    "compile": False,
+}
+"""What differs from the defaults: a small budget, and no pictures."""
+
+Policy = Callable[[TensorDict], TensorDict]
+
+
+class PI:
+    """u = kp e + ki ∫ e dt, within bounds; the integral stands still where they are reached.
+
+    Args:
+        task: the task, of which it reads speed and reference.
+        kp: gain in V per rad/s.
+        ki: gain of the integral in V per rad.
+    """
+
+    def __init__(self, task: Task, kp: float, ki: float) -> None:
+        self.task, self.kp, self.ki = task, kp, ki
+
+    def __call__(self, tensordict: TensorDict) -> TensorDict:
+        """Act."""
+        state = self.task.locate(tensordict["observation"])
+        reference = self.task.outside.values(self.task.split(state)[1])["reference"]
+        error = reference - state[..., :1]
+        if bool(tensordict["is_init"].all()):
+            self.integral = torch.zeros_like(error)
+        integral = self.integral + self.task.time_step * error
+        wanted = self.kp * error + self.ki * integral
+        action = self.task.clip_action(wanted)
+        outward = (wanted != action) & (wanted * error > 0)
+        self.integral = torch.where(outward, self.integral, integral)
+        return tensordict.set("action", action)
+
+
+def world_of(task: Task, changes: Mapping[str, Any]) -> SimulatedWorld:
+    """The simulated world, with other constants or another load."""
+    return SimulatedWorld(task, SimulatedConfig(**changes))
+
+
+@torch.no_grad()
+def play(
+    policy: Policy,
+    task: Task,
+    changes: Mapping[str, Any],
+    *,
+    episodes: int,
+    seed: int,
+    steps: int | None = None,
+    constant: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Speeds and references after each step, ``[steps, episodes]``.
+
+    Args:
+        policy: what acts.
+        task: the task.
+        changes: settings of the world.
+        episodes: number of episodes.
+        seed: seed of the first states and of the references.
+        steps: steps of an episode. Defaults to the task's limit.
+        constant: whether the reference stays at its first value.
+    """
+    model = world_of(task, changes).model()
+    assert model is not None
+    generator = torch.Generator().manual_seed(seed)
+    state = task.sample_start([episodes], generator)
+    drawn = task.outside.draw([episodes], task.max_steps + 1, generator)
+    if constant:
+        drawn = {name: values[:, :1] for name, values in drawn.items()}
+    torch.manual_seed(seed)
+    speeds, references = [], []
+    for step in range(steps or task.max_steps):
+        state = task.with_signals(state, task.outside.window(drawn, step))
+        observed = TensorDict(
+            observation=model.observe(state),
+            is_init=torch.full([episodes, 1], step == 0),
+            batch_size=[episodes],
+        )
+        state = model.transition(state, policy(observed)["action"]).next_state
+        speeds.append(state[:, 0])
+        references.append(task.outside.window(drawn, step + 1)[:, 0])
+    return torch.stack(speeds), torch.stack(references)
+
+
+def rms(speeds: Tensor, references: Tensor) -> float:
+    """Root of the mean squared error over all steps and episodes, in rad/s."""
+    return (speeds - references).square().mean().sqrt().item()
+
+
+def loss(speeds: Tensor, references: Tensor) -> float:
+    """The mean of what the task's reward takes."""
+    speed, reference = speeds.unsqueeze(-1), references.unsqueeze(-1)
+    motor = get_task("motor")
+    return -motor.reward(speed, speed, speed, reference=reference).mean().item()
+
+
+def tune(task: Task, episodes: int, criterion: Callable[[Tensor, Tensor], float]) -> PI:
+    """The PI controller that is best by a criterion, in the world as it is."""
+
+    def cost(logs: Any) -> float:
+        kp, ki = (math.exp(x) for x in logs)
+        played = play(PI(task, kp, ki), task, {}, episodes=episodes, seed=TUNING_SEED)
+        return criterion(*played)
+
+    tried = [
+        minimize(cost, [math.log(kp), math.log(ki)], method="Nelder-Mead", options={"maxfev": 30})
+        for kp, ki in ((0.5, 1.0), (2.0, 5.0))
+    ]
+    best = min(tried, key=lambda found: found.fun)
+    return PI(task, *(math.exp(x) for x in best.x))
+
+
+def measure(policy: Policy, task: Task, episodes: int) -> dict[str, dict[str, float]]:
+    """RMS error on random references, and steady errors on constant ones, in each world."""
+    found = {}
+    for name, changes in WORLDS.items():
+        options: dict[str, Any] = {"episodes": episodes, "seed": EVALUATION_SEED}
+        moving = play(policy, task, changes, **options)
+        speeds, references = play(
+            policy, task, changes, steps=STEADY_STEPS, constant=True, **options
+        )
+        last = (speeds - references)[-50:]
+        found[name] = {
+            "rms": rms(*moving),
+            "steady_error": last.mean(0).abs().mean().item(),
+            "steady_error_largest": last.mean(0).abs().max().item(),
+            "steady_ripple": last.std(0).mean().item(),
+        }
+    return found
+
+
+def train(name: str, seed: int, updates: int) -> tuple[Any, float]:
+    """Learn, with the settings above; returns the agent and seconds."""
+    settings = {**SETTINGS, "seed": seed, "policy.updates": updates}
+    begun = time.perf_counter()
+    with tempfile.TemporaryDirectory() as place:
+        agent = learn(name, overrides=settings, run_dir=f"{place}/run").agent
+    return agent, time.perf_counter() - begun
+
+
+def write(result: Mapping[str, Any], results: Path) -> None:
+    """Write the result of a task and seed, and the table of all so far."""
+    name = f"{result['task']}-{result['seed']}" if result["seed"] is not None else result["task"]
+    results.mkdir(parents=True, exist_ok=True)
+    (results / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+    every = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
+    rows = [
+        [r["task"], controller, world, *(f"{m[key]:.3g}" for key in
+         ("rms", "steady_error", "steady_error_largest", "steady_ripple"))]
+        for r in every
+        for controller, worlds in r["measured"].items()
+        for world, m in worlds.items()
+    ]  # fmt: skip
+    head = ["task", "controller", "world", "RMS error", "steady error", "its largest", "ripple"]
+    commits = sorted({commit_text(r["origin"]) for r in every})
+    machines = sorted({machine_text(r["origin"]) for r in every})
+    gains = "; ".join(
+        f"{name}: kp = {g['kp']:.3g}, ki = {g['ki']:.3g}"
+        for r in every
+        for name, g in r.get("gains", {}).items()
+    )
+    (results / "README.md").write_text(
+        "# A motor's speed on a random reference\n\n"
+        "Made by `python benchmarks/paper/tracking.py`. Do not edit. All errors are in rad/s, of "
+        f"{every[0]['episodes']} episodes of evaluation. The RMS error is of random references of "
+        "steps, ramps and sines. Steady errors are of constant references: the mean error of the "
+        "last second, its size on average and at most over the episodes; the ripple is the "
+        f"standard deviation within that second. PI controllers are tuned in the world as it "
+        f"is ({gains}); nobody is told of other worlds. *motor-preview* knows the "
+        "reference of the next five steps, which a PI controller has no use for.\n\n"
+        f"{markdown_table(head, rows)}\n"
+        f"Commits: {', '.join(commits)}. Machines: {'; '.join(machines)}, shared with other work.\n"
+    )
+    for row in rows:
+        if row[0] == result["task"]:
+            print(*row, sep=" | ", flush=True)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Tune, learn, measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, nargs="*", default=[100])
+    parser.add_argument("--tasks", nargs="*", choices=TASKS, default=list(TASKS))
+    parser.add_argument("--updates", type=int, default=2500)
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    arguments = parser.parse_args(words)
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    import_plugins([f"{RIGS / 'motor.py'}"])
+    episodes = arguments.episodes
+    task = get_task("motor")
+    controllers = {
+        f"PI, {by}": tune(task, episodes, criterion)
+        for by, criterion in {"least RMS error": rms, "highest return": loss}.items()
+    }
+    write(
+        {
+            "task": "motor",
+            "seed": None,
+            "gains": {name: {"kp": pi.kp, "ki": pi.ki} for name, pi in controllers.items()},
+            "episodes": episodes,
+            "measured": {name: measure(pi, task, episodes) for name, pi in controllers.items()},
+            "origin": describe_origin(0),
+        },
+        arguments.results,
+    )
+    for seed in arguments.seeds:
+        for name in arguments.tasks:
+            agent, seconds = train(name, seed, arguments.updates)
+            task = get_task(name)
+            measured = {
+                f"planner, seed {seed}": measure(agent, task, episodes),
+                f"actor, seed {seed}": measure(agent.actor_alone(), task, episodes),
+            }
+            write(
+                {
+                    "task": name,
+                    "seed": seed,
+                    "seconds": seconds,
+                    "updates": arguments.updates,
+                    "settings": SETTINGS,
+                    "episodes": episodes,
+                    "measured": measured,
+                    "origin": describe_origin(seed),
+                },
+                arguments.results,
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""One step of a task: what of an action acts, what moves, what is earned, and what ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.tasks.states import States
+
+RewardFn = Callable[..., Tensor]
+"""``state [*batch, n], action [*batch, m], next_state [*batch, n] -> reward [*batch]``.
+
+With a parameter ``reference`` or ``inputs`` it gets that signal too, ``[*batch, k]``."""
+TerminatedFn = Callable[..., Tensor]
+"""``next_state [*batch, n] -> bool [*batch]``; it may have those parameters as well."""
+Step = Callable[[Tensor, Tensor], Tensor]
+"""``state, action [*batch, m] -> next_state``, of the system's components, for what acts on it."""
+
+
+class Transition(NamedTuple):
+    """The result of one step of a task.
+
+    Args:
+        next_state: state after the step, ``[*batch, n]``.
+        reward: reward of the step, ``[*batch]``.
+        terminated: whether the step ends the episode, bool ``[*batch]``.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> stay = lambda state, action: state
+        >>> found = get_task("pendulum").transition(stay, torch.tensor([0.5, 0.0]), torch.ones(1))
+        >>> round(found.reward.item(), 3), found.terminated.item()
+        (-0.251, False)
+    """
+
+    next_state: Tensor
+    reward: Tensor
+    terminated: Tensor
+
+
+class Steps(States):
+    """How a step of a task is composed.
+
+    A :class:`~phihp_torchrl.Task` is one of these; it has the fields that they read.
+    """
+
+    if TYPE_CHECKING:  # fields of the task
+
+        @property
+        def time_step(self) -> float: ...
+        @property
+        def reward(self) -> RewardFn: ...
+        @property
+        def terminated(self) -> TerminatedFn | None: ...
+        @property
+        def _reads(self) -> Mapping[str, tuple[str, ...]]: ...
+
+    def command(self, registers: Tensor, action: Tensor) -> Tensor:
+        """The command that is given for an action: in its bounds, and within its rate.
+
+        Args:
+            registers: the registers before the step, ``[*batch, r]``.
+            action: the action of the step, ``[*batch, m]``.
+        """
+        return self.registers.command(registers, self.clip_action(action), self.time_step)
+
+    def acting(self, registers: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what acts on the system during a step, and the registers after it.
+
+        Args:
+            registers: the registers before the step, ``[*batch, r]``.
+            action: the action of the step, ``[*batch, m]``; :meth:`command` is made of it.
+        """
+        return self.registers.step(registers, self.command(registers, action), self.time_step)
+
+    def transition(self, step: Step, state: Tensor, action: Tensor) -> Transition:
+        """Take one step of the task, in which ``step`` (of a world or a model) moves the state.
+
+        This is the only place where an action becomes a command, what is under way moves on, the
+        state is moved, the reward and its prices are computed and the termination is decided.
+
+        Args:
+            step: ``(physical state, action) -> next physical state``.
+            state: the state before the step, ``[*batch, n]``.
+            action: the action, in physical units, ``[*batch, m]``; see :meth:`command`.
+
+        Returns:
+            The next state, the reward less the prices of :meth:`price`, and whether the episode has
+            terminated.
+        """
+        before, registers = self.split(state)
+        action = self.command(registers, action)
+        if not self.register_count:
+            next_state = moved = step(state, action)
+        else:
+            acting, after = self.registers.step(registers, action, self.time_step)
+            moved = step(before, acting)
+            if (drift := self.registers.drift(registers)) is not None:
+                moved = moved + self.time_step * drift
+            next_state = torch.cat([moved, after], -1)
+        reward = self.earned(state, action, next_state)
+        if (price := self.registers.price(registers, action)) is not None:
+            reward = reward - price
+        return Transition(next_state, reward, self.is_terminated(next_state))
+
+    def earned(self, state: Tensor, command: Tensor, next_state: Tensor) -> Tensor:
+        """The reward of a step without prices, ``[*batch]``.
+
+        Args:
+            state: the state before the step, ``[*batch, n]``.
+            command: the command of the step, ``[*batch, m]``.
+            next_state: the state after it, ``[*batch, n]``.
+        """
+        (before, _), (moved, after) = self.split(state), self.split(next_state)
+        return self.reward(before, command, moved, **self._signals_of("reward", after))
+
+    def _signals_of(self, function: str, registers: Tensor) -> dict[str, Tensor]:
+        """The signals that a function of the task reads, by the names of its parameters."""
+        if not (keys := self._reads[function]):
+            return {}
+        values = self.outside.values(registers)
+        return {key: values[key] for key in keys}
+
+    def price(self, state: Tensor, action: Tensor) -> Tensor | None:
+        """What a step costs where the task is imagined, ``[*batch]``; ``None`` for nothing.
+
+        A world gives rewards without prices, so whoever learns from its steps subtracts them.
+
+        Args:
+            state: the state before the step, ``[*batch, n]``.
+            action: the action of the step, ``[*batch, m]``.
+        """
+        _, registers = self.split(state)
+        return self.registers.price(registers, self.command(registers, action))
+
+    def is_terminated(self, next_state: Tensor) -> Tensor:
+        """Whether ``next_state`` ``[*batch, n]`` ends the episode, bool ``[*batch]``."""
+        if self.terminated is None:
+            return torch.zeros(next_state.shape[:-1], dtype=torch.bool, device=next_state.device)
+        moved, registers = self.split(next_state)
+        return self.terminated(moved, **self._signals_of("terminated", registers))

@@ -1,0 +1,88 @@
+"""One fit of phase 1: the choice of the integrator, and what is measured of the model."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from phihp_torchrl.dynamics import (
+    AUTO,
+    BLOCK,
+    SOLVERS,
+    DynamicsLoss,
+    FitConfig,
+    FitReport,
+    PhysicsPrior,
+    fit_solver,
+    rollout_error,
+)
+from phihp_torchrl.trainers.model_config import ModelConfig
+
+_log = logging.getLogger(__name__)
+
+
+def chooses_solver(config: ModelConfig) -> bool:
+    """Whether the first and the last fit choose the integrator; Adam is too slow for trials."""
+    return config.integrator == AUTO and config.fit.method != "adam"
+
+
+def fit_choosing(
+    loss: DynamicsLoss,
+    train: TensorDict,
+    held_out: TensorDict,
+    config: FitConfig,
+    generator: torch.Generator,
+) -> FitReport:
+    """Fit, choose the integrator by held-out error, and say which.
+
+    Args:
+        loss: the loss of the model, which then has the chosen integrator.
+        train: transitions to fit.
+        held_out: transitions for the choice.
+        config: how to fit.
+        generator: source of mini-batches.
+    """
+    report, trials = fit_solver(loss, train, held_out, config, generator)
+    if len(trials) > 1:
+        tried = ", ".join(str(trial) for trial in trials)
+        solver = loss.dynamics.integrator
+        _log.info("The model is integrated by %s (held-out errors: %s).", solver, tried)
+    return report
+
+
+def solver_number(loss: DynamicsLoss) -> int | None:
+    """The number of the model's integrator among those that are tried, for checkpoints."""
+    return next((i for i, s in enumerate(SOLVERS) if s is loss.dynamics.integrator), None)
+
+
+def measures(
+    loss: DynamicsLoss, report: FitReport, train: TensorDict, blocks: TensorDict | None
+) -> dict[str, Tensor | float]:
+    """What is logged of a fitted model.
+
+    Args:
+        loss: the loss of the model.
+        report: what the fit reports.
+        train: the fitted transitions.
+        blocks: held-out transitions in a row, for the error of rollouts; ``None`` for none.
+    """
+    dynamics = loss.dynamics
+    state, action, _ = loss.transitions(train)
+    found: dict[str, Tensor | float] = {
+        "model/train_error": report.train_error,
+        "model/held_out_error": report.held_out_error,
+        "model/fit_steps": report.steps,
+        "model/fit_seconds": report.seconds,
+        "model/lambda": loss.lambda_,
+        "model/residual_share": dynamics.residual_share(state, action),
+    }
+    if blocks is not None:
+        found[f"model/rollout_error_{BLOCK}"] = rollout_error(loss, blocks)
+    if isinstance(dynamics.prior, PhysicsPrior):
+        constants = dynamics.prior.constants()
+        for name, value in dynamics.task.system.identifiable(constants).items():
+            found[f"constants/{name}"] = value.detach()
+    return found

@@ -1,0 +1,141 @@
+"""Where phase 1 has its real transitions from: an environment, or recordings."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.imagination import Batch
+from phihp_torchrl.recordings import transitions
+from phihp_torchrl.tasks import Task
+from phihp_torchrl.trainers.collect import Policy, drop_unusable, steady, within_rate
+from phihp_torchrl.worlds import World, command_memory, crossings_text, guard_env
+
+_log = logging.getLogger(__name__)
+
+_SAME_STEP = 1e-3
+"""Recorded time steps within this share of the task's are the task's."""
+
+
+class RealData:
+    """The source of real transitions: the environment of a world, or all of its recordings.
+
+    Args:
+        task: the task.
+        world: the real world.
+        guards: by name of what a guard watches, its largest size, or lowest and highest value.
+    """
+
+    def __init__(
+        self, task: Task, world: World, guards: Mapping[str, float | tuple[float, float]]
+    ) -> None:
+        self.task = task
+        self.crossings: Counter[str] = Counter()
+        """How often each guard ended an episode of the last steps."""
+        self.env: EnvBase | None = None
+        if world.has_env:
+            self.env = guard_env(world.make_env(), task, guards, self.crossings)
+        self.recorded = _recorded(world)
+        """All transitions of a world that has recordings alone; ``None`` for other worlds."""
+
+    def use(self, task: Task, world: World) -> None:
+        """Go on with a task that has got an actuator, and show what is under way."""
+        self.task = task
+        if self.env is not None:
+            memory = Compose(*command_memory(task))
+            self.env = TransformedEnv(self.env, memory, auto_unwrap=False)
+        else:
+            self.recorded = _recorded(world)
+
+    def take(
+        self, steps: int, policy: Policy, seed: int, *, counts: bool = False
+    ) -> tuple[TensorDict, int]:
+        """Take real steps.
+
+        Args:
+            steps: how many.
+            policy: what acts.
+            seed: seed of the environment, for the states in which episodes start.
+            counts: whether to keep the number of each step in its episode.
+
+        Returns:
+            The transitions of which no number is missing, and how many others there were.
+
+        Raises:
+            ConfigError: if too many steps miss a number.
+        """
+        assert self.env is not None
+        self.env.set_seed(seed)
+        self.crossings.clear()
+        with torch.no_grad():
+            policy = within_rate(self.task, steady(self.task, policy))
+            rollout = self.env.rollout(steps, policy, break_when_any_done=False)
+        self._tell_crossings(steps)
+        done = rollout["next", "done"].clone()
+        done[-1] = True  # the next rollout starts from a reset
+        data = TensorDict(
+            observation=rollout["observation"].float(),
+            action=rollout["action"].float(),
+            next=TensorDict(
+                observation=rollout["next", "observation"].float(),
+                reward=rollout["next", "reward"].float(),
+                done=done,
+                terminated=rollout["next", "terminated"],
+                batch_size=[steps],
+            ),
+            batch_size=[steps],
+        ).detach()
+        if counts:
+            data["step_count"] = rollout["step_count"]
+        return drop_unusable(data)
+
+    def _tell_crossings(self, steps: int) -> None:
+        """Warn where guards ended episodes."""
+        if self.crossings:
+            _log.warning(
+                "Guards ended %d episodes in %d real steps (%s). If the plant should not come near "
+                "them, lower model.collect.exploration.amplitude or rate, or explore around a "
+                "controller (model.collect.exploration.controller).",
+                self.crossings.total(),
+                steps,
+                crossings_text(self.crossings),
+            )
+
+
+def replay_batch(task: Task, data: TensorDict | None) -> Batch:
+    """Real transitions ``[N]`` as replay keeps them: with rewards less prices.
+
+    Args:
+        task: the task.
+        data: the transitions; ``None`` for none.
+    """
+    if data is None:
+        state, action = torch.zeros(0, task.state_dim), torch.zeros(0, task.action_dim)
+        return Batch(state, action, torch.zeros(0), state, torch.zeros(0, dtype=torch.bool))
+    state = task.locate(data["observation"])
+    next_state = task.locate(data["next", "observation"])
+    action = data["action"]
+    # "done" in the data includes truncations, which are not terminations.
+    terminated = task.is_terminated(next_state)
+    reward, price = data["next", "reward"][:, 0], task.price(state, action)
+    reward = reward if price is None else reward - price
+    return Batch(state, action, reward, next_state, terminated)
+
+
+def _recorded(world: World) -> TensorDict | None:
+    """All transitions of a world that has recordings alone; ``None`` for other worlds."""
+    if world.has_env:
+        return None
+    if world.recordings is None:
+        raise ConfigError("world", f"{world} has neither an environment nor recordings.")
+    data = transitions(world.task, world.recordings)
+    # Equal time steps are the task's, for which a model is faster.
+    if torch.allclose(data["time_step"], torch.tensor(world.task.time_step), rtol=_SAME_STEP):
+        del data["time_step"]
+    return data
