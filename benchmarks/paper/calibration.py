@@ -133,6 +133,13 @@ def write(results: dict[str, dict[str, Any]], not_run: Iterable[str]) -> None:
     (RESULTS / "README.md").write_text(f"{text}\nMade at: {origins}.\n")
 
 
+def write_all() -> None:
+    """The tables of what is in the directory."""
+    files = {task: RESULTS / f"{task}.json" for task in TARGETS}
+    done = {task: json.loads(path.read_text()) for task, path in files.items() if path.is_file()}
+    write(done, [task for task in TARGETS if task not in done])
+
+
 @torch.no_grad()
 def main() -> None:
     """Calibrate, play and write."""
@@ -151,10 +158,9 @@ def main() -> None:
         if not arguments.only_imagine:
             found["world"] = played(agent, found["changes"])
         (RESULTS / f"{task}.json").write_text(json.dumps(found, indent=1) + "\n")
-    files = {task: RESULTS / f"{task}.json" for task in TARGETS}
-    done = {task: json.loads(path.read_text()) for task, path in files.items() if path.is_file()}
-    if done:
-        write(done, [task for task in TARGETS if task not in done])
+        write_all()
+    if arguments.only_write:
+        write_all()
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
 from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, run
+from phihp_torchrl.trainers.calibrate_budget import final_steps
 from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
 
 from .run_parts import CONFIG, with_sections
@@ -164,7 +165,9 @@ def test_the_budget_ends_doubt_and_shortens_plans():
     small = finished(make_agent(), replace(TINY, confidence=1e6, budget=100_000))
     assert small.final["episodes"] == TINY.episodes
     assert small.final["steps"] == TINY.rounds[-1]
-    assert finished(make_agent()).final["steps"] == 20  # the whole episode
+    assert final_steps(TINY, SMALL, rest=1e9, longest=20) == 20  # the whole episode
+    # Two plans, three calls each, of three rows with 32 candidates.
+    assert final_steps(TINY, SMALL, rest=8 * 2 * 3 * (1000 + 96), longest=20) == 8
 
 
 # The agent that is shipped.

@@ -15,8 +15,8 @@ from omegaconf import OmegaConf
 from phihp_torchrl import load_config
 from phihp_torchrl.config import ConfigError, compose_yaml, get_method
 from phihp_torchrl.trainers import CalibrateConfig, read_run_config, run
-from phihp_torchrl.trainers.run_config import read_request
 from phihp_torchrl.trainers.run_directory import RunDirectory
+from phihp_torchrl.trainers.run_request import read_request
 
 from .run_parts import CONFIG, rows, with_sections
 
