@@ -89,8 +89,8 @@ def write_report(results: Path, names: Sequence[str]) -> None:
     for name in names:
         aims = {run["target"] for run in runs if run["task"] == name}
         both = [s for s in mine if s.task == name] + [s for s in others if s.task == name]
-        for s in both if aims else ():
-            aim = f"{aims.copy().pop():g}" if s in mine else ""
+        for s in both:
+            aim = f"{max(aims):g}" if s in mine else ""
             spread = f"{s.lowest:.1f} to {s.highest:.1f}" if s.seeds > 1 else "one seed"
             cells = [name, s.method, f"{s.steps:,}", f"{s.mean:.1f}", spread, str(s.seeds), aim]
             rows.append([cell.replace("-", "−") if i in (3, 4, 6) else cell
