@@ -186,8 +186,8 @@ def _columns(function: Callable[[Tensor], Tensor], at: Tensor) -> tuple[Tensor, 
     size = at.shape[-1]
     ways = torch.eye(size).to(at).reshape(size, *[1] * (at.ndim - 1), size)
     many, ways = at.repeat(size, *[1] * at.ndim), ways.repeat(1, *at.shape[:-1], 1)
-    value, columns = jvp(function, (many,), (ways,))
-    return value[0], columns.movedim(0, -1)
+    found = jvp(function, (many,), (ways,))
+    return found[0][0], found[1].movedim(0, -1)
 
 
 def _positive(matrix: Tensor) -> Tensor:

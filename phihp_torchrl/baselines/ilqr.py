@@ -185,9 +185,12 @@ class ILQR(Controller):
         factor = torch.where(best > 0, _EASE, _BRAKE)
         damping = torch.where(active, (damping * factor).clamp(_LEAST, _MOST), damping)
         # A row whose plan is kept keeps it to the bit.
-        keep = [torch.where(better[:, None], new, old)
-                for new, old in zip(taken[:2], plan[:2], strict=True)]  # fmt: skip
-        return Trajectory(*keep, torch.where(better, taken.cost, plan.cost)), damping
+        kept = Trajectory(
+            torch.where(better[:, None], taken.states, plan.states),
+            torch.where(better[:, None], taken.actions, plan.actions),
+            torch.where(better, taken.cost, plan.cost),
+        )
+        return kept, damping
 
 
 def solve(problem: Expansion, actions: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:

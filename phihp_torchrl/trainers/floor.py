@@ -20,8 +20,10 @@ class Floor:
     """Tells from how many starts an actor earns no more than without any skill.
 
     The floor of a start is the larger return of two policies: one that does nothing (the action 0,
-    clipped to its bounds) and one whose actions are uniformly random. Their difference is the noise
-    that an actor has to exceed. A sparse reward leaves an actor at the floor from most starts,
+    clipped to its bounds) and one whose actions are uniformly random. How much the larger exceeds
+    either of them varies from start to start; the lesser of these deviations is the noise that an
+    actor has to exceed, so that a policy under which the system runs away adds none. A sparse
+    reward leaves an actor at the floor from most starts,
     while its mean may already be above the floor because a few starts lie near the goal.
 
     Args:
@@ -63,7 +65,7 @@ class Floor:
             for policy in (nothing, anything)
         ]
         self.returns = torch.maximum(*totals)
-        self.noise = float((totals[0] - totals[1]).std(correction=0))
+        self.noise = min(float((self.returns - each).std(correction=0)) for each in totals)
 
     def share(self, returns: Tensor) -> float:
         """The share of starts at the floor, for an actor's returns ``[N]`` from the same starts."""

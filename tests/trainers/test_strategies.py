@@ -113,6 +113,16 @@ def test_a_stopped_search_goes_on_where_it_was() -> None:
     assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
 
 
+def test_random_actions_that_run_away_hide_no_skill() -> None:
+    def reward(state, action, next_state):
+        return -(next_state**2).sum(-1) - 1e4 * (action**2).sum(-1)
+
+    task = replace(get_task("pendulum"), max_steps=5, reward=reward)
+    model = TaskWorldModel(task, HybridDynamics.hybrid(task))
+    floor = Floor(model, task.reset.sample([10]), 5, seed=0)
+    assert floor.share(floor.returns + 1.0) == 0.0
+
+
 def test_few_good_starts_do_not_hide_that_most_are_at_the_floor() -> None:
     task = replace(get_task("pendulum"), max_steps=5)
     model = TaskWorldModel(task, HybridDynamics.hybrid(task))
