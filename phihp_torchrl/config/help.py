@@ -64,7 +64,7 @@ def sentences_of(cls: type) -> dict[str, str]:
     Examples:
         >>> from phihp_torchrl.agents import TD3Config
         >>> sentences_of(TD3Config)["gamma"]
-        'discount γ.'
+        'discount γ, or its time constant, such as "5 s".'
     """
     found: dict[str, str] = {}
     for base in reversed(cls.__mro__):

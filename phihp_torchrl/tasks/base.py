@@ -84,6 +84,7 @@ class Task(Steps):
             the field.
 
     Examples:
+        >>> import torch
         >>> from phihp_torchrl import get_task
         >>> task = get_task("pendulum-swingup")
         >>> state = task.reset.sample([3])

@@ -96,10 +96,22 @@ def test_two_chunks_are_one_longer_chunk():
     )
     whole, expected = step_worlds(model, act, actor, worlds, noise, bounds, max_age=3)
     first, middle = step_worlds(
-        model, act, actor, worlds, ChunkNoise(*(n[:2] for n in noise)), bounds, 3
+        model,
+        act,
+        actor,
+        worlds,
+        ChunkNoise(*(n if n is None else n[:2] for n in noise)),
+        bounds,
+        3,
     )
     second, end = step_worlds(
-        model, act, actor, middle, ChunkNoise(*(n[2:] for n in noise)), bounds, 3
+        model,
+        act,
+        actor,
+        middle,
+        ChunkNoise(*(n if n is None else n[2:] for n in noise)),
+        bounds,
+        3,
     )
     for column, one, two in zip(whole, first, second, strict=True):
         assert torch.equal(column, torch.cat([one, two]))
@@ -196,7 +208,7 @@ def test_splitting_the_worlds_changes_nothing(name):
     steps = by_step(batch)
     for i in range(0, WORLDS, 2):
         ours = slice(i, i + 2)
-        some = ChunkNoise(*(part[:, ours] for part in noise))
+        some = ChunkNoise(*(part if part is None else part[:, ours] for part in noise))
         part = Worlds(*(column[ours] for column in worlds))
         found, ends = step_worlds(model, act, actor, part, some, bounds, max_age=3)
         for step, alone in zip(steps, by_step(found), strict=True):
@@ -271,7 +283,7 @@ def test_noise_is_reproducible():
     before = torch.get_rng_state()
     first, again, other = draw(0), draw(0), draw(1)
     assert torch.equal(before, torch.get_rng_state())
-    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(first[:4], again[:4], strict=True))
     assert not torch.equal(first.exploration, other.exploration)
 
 

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
+from phihp_torchrl.baselines import BASELINES
+
 # Metrics of returns in the real world, and who earned them: first during training, then at the end.
 _TRAINING = {
     "return_mean": "actor",
@@ -123,7 +125,9 @@ def _returns(row: Mapping[str, str]) -> Iterator[tuple[str, str]]:
         if not value:
             continue
         if name.startswith(start) and name.endswith(end):
-            yield name.removeprefix(start).removesuffix(end), name
+            # Baselines play beside what was learned, and are no part of its curve.
+            if (acting := name.removeprefix(start).removesuffix(end)) not in BASELINES:
+                yield acting, name
         elif not name.startswith(start) and (acting := _TRAINING.get(name.rpartition("/")[2])):
             yield acting, name
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-import crane
+import learn_crane
 from phihp_torchrl import HybridDynamics, get_task
 from phihp_torchrl.baselines import make_baselines
 from phihp_torchrl.origin import describe_origin
@@ -14,7 +14,7 @@ from phihp_torchrl.trainers import import_plugins
 
 @pytest.fixture(scope="module", autouse=True)
 def rig():
-    import_plugins([str(crane.RIG)])
+    import_plugins([str(learn_crane.RIG)])
 
 
 def test_a_push_moves_the_trolley_by_its_own_mass_at_first():
@@ -44,7 +44,7 @@ def test_a_run_with_one_strategy_is_kept_beside_the_other(tmp_path):
             "results": {"actor": {"returns": [-2.0, -4.0]}},
             "origin": describe_origin(7),
         }
-        crane.write(result, tmp_path)
+        learn_crane.write(result, tmp_path)
     assert len(list(tmp_path.glob("*.json"))) == 2
     page = (tmp_path / "README.md").read_text()
     assert page.count("| actor | -3.0 | 1.0 |") == 2

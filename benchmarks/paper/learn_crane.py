@@ -1,7 +1,7 @@
 """A crane in newtons and kilograms, learned in its own units, beside LQR and PID.
 
-    python benchmarks/paper/crane.py --seed 100
-    python benchmarks/paper/crane.py --seed 100 --single --updates 2500
+    python benchmarks/paper/learn_crane.py --seed 100
+    python benchmarks/paper/learn_crane.py --seed 100 --single --updates 2500
 
 Learns ``rigs/heavy_crane.py``, whose forces are ±4000 N and whose masses are hundreds of kg, from
 real steps of its simulated world with friction, with ``policy.scales=auto`` and a small budget. The
@@ -85,7 +85,7 @@ def write(result: Mapping[str, Any], results: Path) -> None:
     path.write_text(json.dumps(result, indent=1) + "\n")
     text = [
         "# A crane in newtons and metres\n",
-        "Made by `python benchmarks/paper/crane.py`, which says what is learned. Do not edit. "
+        "Made by `python benchmarks/paper/learn_crane.py`, which says what is learned. Do not edit. "
         "Returns are means over the same episodes with their standard errors, each of one trained "
         "agent; 0 is the most. LQR and PID know the agent's learned model, not the truth.\n",
     ]
