@@ -85,7 +85,8 @@ def write(result: Mapping[str, Any], results: Path) -> None:
     path.write_text(json.dumps(result, indent=1) + "\n")
     text = [
         "# A crane in newtons and metres\n",
-        "Made by `python benchmarks/paper/learn_crane.py`, which says what is learned. Do not edit. "
+        "Made by `python benchmarks/paper/learn_crane.py`, which says what is learned. "
+        "Do not edit. "
         "Returns are means over the same episodes with their standard errors, each of one trained "
         "agent; 0 is the most. LQR and PID know the agent's learned model, not the truth.\n",
     ]

@@ -88,6 +88,11 @@ def test_without_noise_the_policy_acts_and_time_goes_on():
     assert (after.age == STEPS).all()
 
 
+def part_of(noise, steps):
+    """The noise of some steps; there are no signals."""
+    return ChunkNoise(*(part if part is None else part[steps] for part in noise))
+
+
 def test_two_chunks_are_one_longer_chunk():
     model, actor, bounds = make("cartpole")
     worlds = start(model)
@@ -100,7 +105,7 @@ def test_two_chunks_are_one_longer_chunk():
         act,
         actor,
         worlds,
-        ChunkNoise(*(n if n is None else n[:2] for n in noise)),
+        part_of(noise, slice(2)),
         bounds,
         3,
     )
@@ -109,7 +114,7 @@ def test_two_chunks_are_one_longer_chunk():
         act,
         actor,
         middle,
-        ChunkNoise(*(n if n is None else n[2:] for n in noise)),
+        part_of(noise, slice(2, None)),
         bounds,
         3,
     )

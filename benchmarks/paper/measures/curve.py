@@ -126,8 +126,8 @@ def _returns(row: Mapping[str, str]) -> Iterator[tuple[str, str]]:
             continue
         if name.startswith(start) and name.endswith(end):
             # Baselines play beside what was learned, and are no part of its curve.
-            if (acting := name.removeprefix(start).removesuffix(end)) not in BASELINES:
-                yield acting, name
+            if (played := name.removeprefix(start).removesuffix(end)) not in BASELINES:
+                yield played, name
         elif not name.startswith(start) and (acting := _TRAINING.get(name.rpartition("/")[2])):
             yield acting, name
 
