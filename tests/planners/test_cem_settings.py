@@ -94,11 +94,13 @@ def test_a_planner_of_settings_has_them_all():
     [
         (
             {"planning_horizon": 0},
-            r"planning_horizon: expected a whole number >= 1 .*got 0",
+            r"planning_horizon: expected a whole number >= 1 "
+            r"of steps, or seconds such as '1\.5 s', got 0",
         ),
         (
             {"planning_horizon": 2.0},
-            r"planning_horizon: expected a whole number >= 1 .*got 2\.0",
+            r"planning_horizon: expected a whole number >= 1 "
+            r"of steps, or seconds such as '1\.5 s', got 2\.0",
         ),
         ({"optim_steps": 0}, r"optim_steps: expected a whole number >= 1, got 0"),
         ({"num_candidates": -1}, r"num_candidates: expected a whole number >= 1, got -1"),
@@ -121,18 +123,21 @@ def test_a_planner_of_settings_has_them_all():
         ({"actor_margin": -1.0}, r"actor_margin: expected a number >= 0, got -1\.0"),
         (
             {"gamma": 1.5},
-            r"gamma: expected a number in \[0, 1\], .*got 1\.5",
+            r"gamma: expected a number in \[0, 1\], "
+            r"or a time constant such as '5 s', got 1\.5",
         ),
         ({"select": "median"}, r"select: expected one of \['mean', 'best'\], got 'median'"),
         ({"tail_dtype": "float16"}, r"tail_dtype: expected one of \['float32', 'bfloat16'\]"),
         (
             {"replan_every": 0},
-            r"replan_every: expected a whole number >= 1 .*got 0",
+            r"replan_every: expected a whole number >= 1 "
+            r"of steps, or seconds such as '1\.5 s', got 0",
         ),
         ({"replan_every": 5}, r"replan_every: expected at most planning_horizon = 4, got 5"),
         (
             {"replan_every": 1.5},
-            r"replan_every: expected a whole number >= 1 .*got 1\.5",
+            r"replan_every: expected a whole number >= 1 "
+            r"of steps, or seconds such as '1\.5 s', got 1\.5",
         ),
         ({"compare_with_actor": 1}, r"compare_with_actor: expected true or false, got 1"),
         ({"warm_start": 1}, r"warm_start: expected true or false, got 1"),
