@@ -128,8 +128,8 @@ def test_imagined_worlds(compile):
     rollouts = Rollouts(model.cuda(), act, task.max_steps, device="cuda", compile=compile)
     there, after = rollouts.chunk(
         [weight.cuda() for weight in weights],
-        Worlds(*(part.cuda() for part in worlds)),
-        type(noise)(*(part.cuda() for part in noise)),
+        worlds.to("cuda"),
+        noise.to("cuda"),
     )
     close(there.next_state, expected.next_state)
     assert after.age.device.type == "cuda"

@@ -29,7 +29,7 @@ from phihp_torchrl import Agent, load_agent
 from phihp_torchrl.agents import TD3Config, TD3Update, act, make_td3_loss
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.evaluation import markdown_table
-from phihp_torchrl.imagination import Batch, ChunkNoise, Rollouts, Worlds, draw_noise
+from phihp_torchrl.imagination import Batch, Rollouts, Worlds, draw_noise
 from phihp_torchrl.origin import describe_origin, origin_text
 
 AGENT = "results/agents/pendulum-swingup"
@@ -65,10 +65,8 @@ def imagines(agent: Agent, batch: int, device: str, compiled: bool) -> tuple[Cal
     rollouts = Rollouts(model, act, task.max_steps, device=device, compile=compiled)
     weights = [p.detach() for p in agent.actor.module.mlp.parameters()]
     starts = task.coverage.sample([CHUNK, batch])
-    noise = draw_noise(starts, task.bounds, std=0.1, random_fraction=0.1)
-    noise = ChunkNoise(*(part.to(device) for part in noise))
-    state, age = task.coverage.sample([batch]).to(device), torch.zeros(batch, dtype=torch.int64)
-    worlds = Worlds(state, age.to(device))
+    noise = draw_noise(starts, task.bounds, std=0.1, random_fraction=0.1).to(device)
+    worlds = Worlds(task.coverage.sample([batch]), torch.zeros(batch, dtype=torch.int64)).to(device)
     return lambda: rollouts.chunk(weights, worlds, noise), CHUNK * batch
 
 

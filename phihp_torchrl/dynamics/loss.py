@@ -77,9 +77,11 @@ class DynamicsLoss(LossModule):
         self.lambda_0, self.tau_ph = lambda_0, tau_ph
         check_positive(self, "lambda_0")
         check_not_negative(self, "tau_ph")
-        self.register_buffer("lambda_", torch.tensor(float(lambda_0)))
-        self.register_buffer("error_scale", torch.ones(dynamics.task.system.state_dim))
-        self.register_buffer("residual_scale", torch.ones(dynamics.task.system.state_dim))
+        device = next((p.device for p in dynamics.parameters()), None)
+        ones = torch.ones(dynamics.task.system.state_dim, device=device)
+        self.register_buffer("lambda_", torch.tensor(float(lambda_0), device=device))
+        self.register_buffer("error_scale", ones)
+        self.register_buffer("residual_scale", ones.clone())
 
     @property
     def in_keys(self) -> list[NestedKey]:

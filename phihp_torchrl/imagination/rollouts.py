@@ -29,6 +29,10 @@ class Worlds(NamedTuple):
     age: Tensor
     """Steps since the last reset, int64 ``[worlds]``."""
 
+    def to(self, device: torch.device | str) -> Worlds:
+        """Return them on another device."""
+        return Worlds(self.state.to(device), self.age.to(device))
+
 
 class ChunkNoise(NamedTuple):
     """All random numbers of a chunk, drawn outside the compiled graph so that seeds reproduce."""
@@ -44,6 +48,10 @@ class ChunkNoise(NamedTuple):
     signals: Tensor | None = None
     """References and inputs after each step, registers ``[steps, worlds, size]``; ``None`` for a
     task without, and where they go on as the model expects."""
+
+    def to(self, device: torch.device | str) -> ChunkNoise:
+        """Return it on another device."""
+        return ChunkNoise(*(part if part is None else part.to(device) for part in self))
 
 
 def draw_noise(

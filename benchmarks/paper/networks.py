@@ -1,0 +1,174 @@
+"""How small networks can be, and at which learning rates: imagined return over CPU time.
+
+    python benchmarks/paper/networks.py --tasks cartpole-swingup --variants default 2x128 --seeds 20
+    python benchmarks/paper/networks.py --only-write       # the tables of what there is
+
+Trains actor and critics in the fitted models of the agents in results/agents, by the task's default
+settings but for those of the variant, and takes note of the imagined return over the seconds of CPU
+spent. No real step is taken and no real episode played: networks are chosen in imagination alone.
+Writes results/networks/{task}-{variant}-seed{seed}.json after every evaluation, and README.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from statistics import mean
+
+import torch
+
+from phihp_torchrl import load_agent, load_config
+from phihp_torchrl.evaluation import TARGETS, markdown_table
+from phihp_torchrl.origin import describe_origin, origin_text
+from phihp_torchrl.trainers import PolicyTrainer, read_run_config
+
+AGENTS, RESULTS = Path("results/agents"), Path("results/networks")
+
+
+def widths(actor: list[int], critic: list[int], *rates: float) -> list[str]:
+    """Settings of networks of these widths, with learning rates of the actor and of the critics."""
+    names = ("actor_learning_rate", "critic_learning_rate")
+    return [
+        f"policy.td3.actor_hidden_sizes={actor}",
+        f"policy.td3.critic_hidden_sizes={critic}",
+        *(f"policy.td3.{name}={rate}" for name, rate in zip(names, rates, strict=False)),
+    ]
+
+
+VARIANTS: dict[str, list[str]] = {
+    "default": [],
+    "2x64": widths([64, 64], [64, 64], 1e-3, 2e-3),
+    "3x64": widths([64, 64], [64, 64, 64], 1e-3, 2e-3),
+    "2x96": widths([96, 96], [96, 96], 1e-3, 2e-3),
+    "2x128": widths([128, 128], [128, 128], 1e-3, 2e-3),
+    "2x128-slow": widths([128, 128], [128, 128]),
+    "3x128": widths([128, 128], [128, 128, 128], 1e-3, 2e-3),
+    "3x128-slow": widths([128, 128], [128, 128, 128], 5e-4, 1e-3),
+    "2x64-128": widths([64, 64], [128, 128], 1e-3, 2e-3),
+}
+
+
+def train(
+    task: str, variant: str, seed: int, path: Path, label: str, compile: bool, commit: str | None
+) -> None:
+    """One policy phase in the model of the task's agent."""
+    agent = load_agent(AGENTS / task)
+    config = read_run_config(load_config(task, overrides=VARIANTS[variant])).section("policy")
+    torch.manual_seed(seed)
+    trainer = PolicyTrainer(agent.task, agent.dynamics, config, seed=seed, compile=compile)
+    origin = describe_origin(seed)
+    if origin["commit"] is None:
+        origin |= {"commit": commit, "dirty": False}
+    curve: list[dict[str, float]] = []
+    begun = time.process_time()
+    while not trainer.done:
+        metrics = trainer.advance()
+        curve.append(
+            {
+                "updates": metrics["policy/updates"],
+                "cpu_seconds": round(time.process_time() - begun, 2),
+                "return": metrics["policy/imagined_return"],
+                "best": metrics["policy/best_imagined_return"],
+                **({"lag": metrics[k]} if (k := "policy/critic_lag") in metrics else {}),
+            }
+        )
+        record = {
+            "task": task,
+            "variant": label,
+            "settings": VARIANTS[variant],
+            "seed": seed,
+            "done": trainer.done,
+            "curve": curve,
+            "origin": origin,
+        }
+        partial = path.with_suffix(".part")
+        partial.write_text(json.dumps(record) + "\n")
+        os.replace(partial, path)
+    print(f"{path.stem}: {curve[-1]}", flush=True)
+
+
+def write_tables(results: Path) -> None:
+    """A table for each task: what variants reach, and when."""
+    runs = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
+    text = (
+        "# Networks\n\nMade by `python benchmarks/paper/networks.py`. Do not edit. Returns are "
+        "imagined, of the best actor. Seconds are of CPU time, one thread, without those to the "
+        "first evaluation, in which everything is compiled.\n"
+    )
+    for task in TARGETS:
+        mine = [run for run in runs if run["task"] == task and run["done"]]
+        if not mine:
+            continue
+        floor = min(run["curve"][0]["best"] for run in mine)
+        top = max(run["curve"][-1]["best"] for run in mine)
+        table = []
+        for variant in sorted({run["variant"] for run in mine}):
+            here = [run for run in mine if run["variant"] == variant]
+            level = floor + 0.98 * (top - floor)
+            reached = [
+                next(
+                    (
+                        p["cpu_seconds"] - run["curve"][0]["cpu_seconds"]
+                        for p in run["curve"]
+                        if p["best"] >= level
+                    ),
+                    None,
+                )
+                for run in here
+            ]
+            per_thousand = [
+                1e3
+                * (run["curve"][-1]["cpu_seconds"] - run["curve"][0]["cpu_seconds"])
+                / (run["curve"][-1]["updates"] - run["curve"][0]["updates"])
+                for run in here
+            ]
+            table.append(
+                [
+                    variant,
+                    ", ".join(str(run["seed"]) for run in here),
+                    ", ".join(f"{run['curve'][-1]['best']:.1f}" for run in here),
+                    f"{mean(run['curve'][-1]['best'] for run in here):.1f}",
+                    ", ".join("–" if s is None else f"{s:.0f}" for s in reached),
+                    f"{mean(per_thousand):.1f}",
+                ]
+            )
+        header = ["networks", "seeds", "best imagined return", "mean"]
+        header += ["seconds to 98 % of the way", "seconds per 1,000 updates"]
+        text += f"\n## {task}\n\n{markdown_table(header, table)}\n"
+    origins = sorted({origin_text(run["origin"]) for run in runs})
+    text += "\n" + "; ".join(origins) + ".\n\nVariants: "
+    text += "; ".join(f"{k}: `{' '.join(v) or 'as set'}`" for k, v in VARIANTS.items()) + ".\n"
+    (results / "README.md").write_text(text)
+
+
+def main() -> None:
+    """Train what is missing, and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
+    parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
+    parser.add_argument("--seeds", nargs="+", type=int, default=[20])
+    parser.add_argument("--label", default="", help="added to the variant's name in the results")
+    parser.add_argument("--eager", action="store_true", help="without compiling")
+    parser.add_argument("--commit", help="of the code, where it is run outside its repository")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--only-write", action="store_true")
+    options = parser.parse_args()
+    options.results.mkdir(parents=True, exist_ok=True)
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    if not options.only_write:
+        for seed in options.seeds:
+            for task in options.tasks:
+                for variant in options.variants:
+                    label = variant + options.label
+                    path = options.results / f"{task}-{label}-seed{seed}.json"
+                    if not (path.is_file() and json.loads(path.read_text())["done"]):
+                        train(task, variant, seed, path, label, not options.eager, options.commit)
+    write_tables(options.results)
+
+
+if __name__ == "__main__":
+    main()
