@@ -60,7 +60,7 @@ def train(
     torch.manual_seed(seed)
     trainer = PolicyTrainer(agent.task, agent.dynamics, config, seed=seed, compile=compile)
     origin = describe_origin(seed)
-    if origin["commit"] is None:
+    if commit:
         origin |= {"commit": commit, "dirty": False}
     curve: list[dict[str, float]] = []
     begun = time.process_time()

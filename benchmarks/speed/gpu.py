@@ -140,7 +140,7 @@ def run_tests(folder: Path) -> dict[str, Any]:
     """Run the tests marked ``cuda``, and keep what they printed."""
     command = [sys.executable, "-m", "pytest", "tests/test_cuda.py", "-p", "no:cacheprovider"]
     start = time.perf_counter()
-    done = subprocess.run([*command, "-q"], capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     (folder / "tests.log").write_text(done.stdout + done.stderr)
     last = done.stdout.strip().splitlines()[-1:] or ["no output"]
     return {"exit": done.returncode, "line": last[0], "seconds": time.perf_counter() - start}
@@ -159,7 +159,7 @@ def page(record: dict[str, Any]) -> str:
     text = (
         "# One GPU against one thread of the CPU\n\n"
         f"Made by `python benchmarks/speed/gpu.py` ({origin_text(record['origin'])}, torch "
-        f"{torch.__version__}, {record['gpu'] or 'no GPU: the CPU alone was timed'}). Networks and "
+        f"{record['origin']['versions']['torch']}, {record['gpu'] or 'no GPU: the CPU alone was timed'}). Networks and "
         f"planner of `{AGENT}`. Each cell is what is done in a second, from the median of the "
         "calls of at least a second; the best of the row is bold, and a dash was not run.\n\n"
         f"Tests marked `cuda`: {record['tests']['line']}.\n"
@@ -203,7 +203,7 @@ def main() -> None:
     cuda = torch.cuda.is_available()
     devices = ["cpu", *(["cuda"] if cuda else [])]
     origin = describe_origin(seed=0)
-    if origin["commit"] is None:
+    if options.commit:
         origin |= {"commit": options.commit, "dirty": False}
     record: dict[str, Any] = {
         "origin": origin,

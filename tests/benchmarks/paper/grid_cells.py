@@ -36,4 +36,4 @@ def words(config: GridConfig) -> list[str]:
 
 def returns(config: GridConfig) -> dict[str, list[float]]:
     results = json.loads(config.files(Path()).evaluation.read_text())
-    return {name: result["returns"] for name, result in results.items()}
+    return {name: results[name]["returns"] for name in ("planner", "actor") if name in results}
