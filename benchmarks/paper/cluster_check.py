@@ -84,6 +84,7 @@ def grid_command(place: Path, launcher: str) -> list[str]:
         f"overrides=[{overrides}]",
         f"hydra.sweep.dir={place / 'multirun'}",
         "refresh=0.5",
+        "allow_dirty=true",  # nothing of it is kept
     ]
 
 

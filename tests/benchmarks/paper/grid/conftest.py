@@ -19,6 +19,7 @@ def config(tmp_path: Path) -> GridConfig:
         seed=0,
         share=0.03,
         overrides=TINY,
+        allow_dirty=True,
         runs=str(tmp_path / "runs"),
         results=str(tmp_path / "kept"),
         claim_wait=0.0,

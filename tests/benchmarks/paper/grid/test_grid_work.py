@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 from grid_cells import PAPER, TINY, do, returns, words
 
-from grid import GridConfig, Status, claim, is_claimed, keep, look
+from grid import GridConfig, Status, claim, is_claimed, keep, look, work
 from grid.display import failures
 from measures import read_curve
+from phihp_torchrl.config import ConfigError
 from report import read_run
 
 
@@ -193,7 +194,13 @@ def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
     # Long enough to be caught in the middle: a checkpoint after every unit, and slow evaluations.
     overrides = [*TINY, "checkpoint_interval=0"]
     quoted = ",".join(f'"{override}"' for override in overrides)
-    command = [sys.executable, str(PAPER / "run_grid.py"), "task=pendulum", "share=0.03"]
+    command = [
+        sys.executable,
+        str(PAPER / "run_grid.py"),
+        "task=pendulum",
+        "share=0.03",
+        "allow_dirty=true",
+    ]
     command += [f"runs={config.runs}", f"results={config.results}", f"overrides=[{quoted}]"]
     metrics = config.files(Path()).run / "metrics.csv"
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL) as process:
@@ -210,3 +217,20 @@ def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
     with (config.files(Path()).kept / "metrics.csv").open() as file:
         units = [int(row["unit"]) for row in csv.DictReader(file)]
     assert units == list(range(len(units)))
+
+
+def test_code_that_no_commit_has_is_refused(
+    config: GridConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("grid.worker.describe_origin", lambda seed: {"dirty": True})
+    with pytest.raises(ConfigError, match=r"allow_dirty: expected a tree without uncommitted"):
+        work(replace(config, allow_dirty=False), Path())
+    assert not config.files(Path()).run.exists()
+
+
+def test_a_proof_plays_the_episodes_that_are_kept_for_it(config: GridConfig) -> None:
+    proof = replace(config, allow_dirty=False, proof=True)
+    assert "evaluate.first_seed=2000000" in proof.words()
+    assert not any(word.startswith("evaluate.first_seed") for word in config.words())
+    with pytest.raises(ConfigError, match=r"allow_dirty: expected false with proof=true"):
+        replace(config, proof=True)
