@@ -16,10 +16,10 @@ from grid import CellFiles, GridConfig, Status
 @pytest.fixture
 def committed(tmp_path: Path) -> CellFiles:
     config = GridConfig(
-        "cem-oracle",
+        "phihp",
         "pendulum",
         100,
-        share=None,
+        share=0.03,
         overrides=TINY,
         allow_dirty=True,
         runs=str(tmp_path / "runs"),
