@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import random
+import sys
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import settings
+from matplotlib.figure import Figure
 
 SEED = 0
 
@@ -31,6 +33,19 @@ def seed() -> int:
     np.random.seed(SEED)
     torch.manual_seed(SEED)
     return SEED
+
+
+@pytest.fixture
+def drawn() -> None:
+    """Request it to have figures drawn; half of the time of a small evaluation goes there."""
+
+
+@pytest.fixture(autouse=True)
+def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every episode's figure is an empty one, which is written all the same."""
+    show = sys.modules.get("phihp_torchrl.evaluation.show")
+    if show is not None and "drawn" not in request.fixturenames:
+        monkeypatch.setattr(show, "episode_figure", lambda episode: Figure(figsize=(1, 1)))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
