@@ -13,7 +13,7 @@ _FLOAT = "tag:yaml.org,2002:float"
 _FAST: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # not every wheel has libyaml
 
 
-class _Loader(_FAST):  # type: ignore[misc]
+class _Loader(_FAST):
     """Reads what OmegaConf reads: plain values, no key twice, ``1e-3`` a number and dates texts."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Any:
