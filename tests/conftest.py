@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,6 +47,21 @@ def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     show = sys.modules.get("phihp_torchrl.evaluation.show")
     if show is not None and "drawn" not in request.fixturenames:
         monkeypatch.setattr(show, "episode_figure", lambda episode: Figure(figsize=(1, 1)))
+
+
+@pytest.fixture
+def aot_eager(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile as always, but for machine code, which takes minutes to make.
+
+    Graphs are traced whole and differentiated, and then run by torch.
+    """
+    compile = torch.compile
+
+    def traced(function: Any, *, fullgraph: bool, dynamic: bool | None, **_: Any) -> Any:
+        return compile(function, fullgraph=fullgraph, dynamic=dynamic, backend="aot_eager")
+
+    monkeypatch.setattr(torch, "compile", traced)
+    torch._dynamo.reset()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
