@@ -32,9 +32,11 @@ CELLS = len(TASKS) * len(SEEDS)
 # The least that the phases can do; the tests of the commands take it too.
 TINY = (
     "compile=false",
+    "evaluate.baselines=none",
     "evaluate.episodes=2",
     "evaluate.latency_actions=3",
     "model.fit.steps=2",
+    "model.integrator=semi_implicit_euler",
     "model.collect.planning_horizon=3",
     "model.collect.replan_every=2",
     "model.collect.num_candidates=8",

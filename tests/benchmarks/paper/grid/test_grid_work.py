@@ -89,34 +89,31 @@ def test_other_methods_leave_what_a_report_reads(
     assert "p50" in run.acting[acting].latency
 
 
-def test_what_an_earlier_version_did_not_keep_is_added(config: GridConfig) -> None:
-    do(config)
-    files = config.files(Path())
+def test_what_an_earlier_version_did_not_keep_is_added(finished: GridConfig) -> None:
+    files = finished.files(Path())
     (files.kept / "curve.csv").unlink()
     (files.kept / "prediction.json").unlink()
-    do(config)
+    do(finished)
     assert read_curve(files.kept / "curve.csv")
     assert (files.kept / "prediction.json").is_file()
-    assert words(config) == ["started", "finished"]
+    assert words(finished) == ["started", "finished"]
 
 
 def test_a_finished_run_that_was_not_kept_is_kept_and_not_run_again(
-    config: GridConfig,
+    finished: GridConfig,
 ) -> None:
-    do(config)
-    files = config.files(Path())
+    files = finished.files(Path())
     rows = (files.run / "metrics.csv").read_text()
     for path in files.kept.iterdir():
         path.unlink()
-    assert do(config).status is Status.DONE
+    assert do(finished).status is Status.DONE
     assert (files.kept / "metrics.csv").read_text() == rows
 
 
 def test_keeping_marks_the_cell_as_done_last(
-    config: GridConfig, monkeypatch: pytest.MonkeyPatch
+    finished: GridConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    do(config)
-    files = config.files(Path())
+    files = finished.files(Path())
     for path in files.kept.iterdir():
         path.unlink()
     module = sys.modules[keep.__module__]
@@ -141,11 +138,10 @@ def test_a_failed_cell_is_reported_and_run_again_on_request_alone(config: GridCo
     assert not files.failure.exists()
 
 
-def test_a_cell_goes_on_with_its_own_settings_alone(config: GridConfig) -> None:
-    do(config)
-    for path in config.files(Path()).kept.iterdir():
+def test_a_cell_goes_on_with_its_own_settings_alone(finished: GridConfig) -> None:
+    for path in finished.files(Path()).kept.iterdir():
         path.unlink()
-    state = do(replace(config, overrides=(*TINY, "policy.updates=16")))
+    state = do(replace(finished, overrides=(*TINY, "policy.updates=16")))
     assert state.status is Status.FAILED
     assert "policy.updates: 16, not 8" in state.detail
 
@@ -170,11 +166,11 @@ def test_another_process_has_it(config: GridConfig) -> None:
 def test_a_claim_ends_with_its_process(tmp_path: Path) -> None:
     lock = tmp_path / "lock"
     code = (
-        "import time; from pathlib import Path; from grid.claim import claim\n"
+        "import time; from pathlib import Path; from claim import claim\n"  # without torch
         f"with claim(Path({str(lock)!r})): print('mine', flush=True); time.sleep(60)"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", code], cwd=PAPER, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code], cwd=PAPER / "grid", stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "mine\n"
@@ -187,10 +183,8 @@ def test_a_claim_ends_with_its_process(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
-    config: GridConfig, tmp_path: Path
+    config: GridConfig, whole: GridConfig, tmp_path: Path
 ) -> None:
-    whole = replace(config, runs=str(tmp_path / "whole"), results=str(tmp_path / "whole_kept"))
-    assert do(whole).status is Status.DONE
     # Long enough to be caught in the middle: a checkpoint after every unit, and slow evaluations.
     overrides = [*TINY, "checkpoint_interval=0"]
     quoted = ",".join(f'"{override}"' for override in overrides)
