@@ -9,7 +9,7 @@ from scipy import stats
 from measures import FEWEST_SEEDS, Difference, difference, holm
 from phihp_torchrl.evaluation import PUBLISHED
 from report.bounds import margin
-from report.paper_systems import PHIHP, systems
+from report.paper_systems import PHIHP, PaperSystem, systems
 from report.results import Results
 from report.sections import Section
 from report.tables import NOT_RUN, Number, Table, TableCell
@@ -55,10 +55,11 @@ def published_difference(task: str, baseline: str) -> Difference | None:
 def significance(results: Results) -> Section:
     """A row for each task and baseline; all rows are one family of tests."""
     pairs = [(task, baseline) for task in results.tasks for baseline in systems("baseline")]
-    own = [
-        difference(*([s.mean for s in results.usual(one, task)] for one in (PHIHP, baseline)))
-        for task, baseline in pairs
-    ]
+
+    def means(system: PaperSystem, task: str) -> list[float]:
+        return [score.mean for score in results.usual(system, task)]
+
+    own = [difference(means(PHIHP, task), means(baseline, task)) for task, baseline in pairs]
     printed = [published_difference(task, baseline.name) for task, baseline in pairs]
     rows: list[list[TableCell]] = []
     columns = zip(pairs, own, _adjusted(own), printed, _adjusted(printed), strict=True)
