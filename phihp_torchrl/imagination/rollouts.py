@@ -51,8 +51,13 @@ class ChunkNoise(NamedTuple):
 
     def to(self, device: torch.device | str) -> ChunkNoise:
         """Return it on another device."""
-        signals = None if self.signals is None else self.signals.to(device)
-        return ChunkNoise(*(part.to(device) for part in self[:4]), signals)
+        return ChunkNoise(
+            self.start_states.to(device),
+            self.exploration.to(device),
+            self.random_actions.to(device),
+            self.use_random.to(device),
+            None if self.signals is None else self.signals.to(device),
+        )
 
 
 def draw_noise(
