@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from phihp_torchrl.config import (
     ConfigError,
     Steps,
+    check_fields,
     check_not_negative,
     check_steps,
     resolve_seconds,
@@ -68,6 +69,7 @@ class CollectConfig:
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_not_negative(self, "noise")
         check_steps(self, "random_hold")
         if self.random_hold != 1 and self.exploration.coloured:

@@ -19,7 +19,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from phihp_torchrl.config import ConfigError, import_named
+from phihp_torchrl.config import ConfigError, check_fields, import_named
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.command_memory import command_memory
@@ -51,6 +51,7 @@ class TorchRLConfig:
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         module, _, function = self.make.partition(":")
         if not (module and function):
             raise ConfigError("make", f"expected module:function, got {self.make!r}.")
