@@ -30,7 +30,7 @@ from phihp_torchrl.config.compose import (
     override_lines,
     parse_overrides,
 )
-from phihp_torchrl.config.convert import INFINITE, check_fields, convert
+from phihp_torchrl.config.convert import INFINITE, check_fields, plain, plain_fields
 from phihp_torchrl.config.durations import (
     Discount,
     Steps,

@@ -6,7 +6,6 @@ import math
 import types
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
-from functools import cache
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from phihp_torchrl.config.checks import LARGEST_FLOAT32
@@ -14,6 +13,8 @@ from phihp_torchrl.config.errors import ConfigError
 
 Read = Callable[[type[Any], Any, str], Any]
 """How a dataclass is read from a mapping, for a dotted name."""
+
+_HINTS: dict[Any, dict[str, Any]] = {}
 
 INFINITE = {"infinite": True}
 """Metadata of a field whose numbers may be infinite, as limits that do not limit."""
@@ -46,10 +47,42 @@ def check_fields(config: Any) -> None:
                 object.__setattr__(config, f.name, kept)
 
 
-@cache
-def hints_of(cls: type[Any]) -> dict[str, Any]:
+def plain_fields(config: Any) -> None:
+    """Make plain numbers and tuples of the arrays and tensors in a frozen dataclass.
+
+    Examples:
+        >>> import numpy as np
+        >>> from phihp_torchrl import Constant
+        >>> Constant(np.float32(0.5), high=np.array(2.0))
+        Constant(guess=0.5, low=0.0, high=2.0, fixed=False)
+    """
+    for f in fields(config):
+        if f.init and (kept := plain(getattr(config, f.name))) is not getattr(config, f.name):
+            object.__setattr__(config, f.name, kept)
+
+
+def plain(value: Any) -> Any:
+    """Make plain numbers, lists of an array and tuples of what NumPy or torch hold.
+
+    Examples:
+        >>> import numpy as np
+        >>> plain((np.float32(0.5), np.int64(3))), plain(np.ones(2))
+        ((0.5, 3), (1.0, 1.0))
+    """
+    if hasattr(value, "tolist") and hasattr(value, "shape"):
+        value = value.tolist()
+        return tuple(value) if isinstance(value, list) else value
+    if type(value) in (tuple, list):
+        kept = tuple(map(plain, value))
+        return value if all(a is b for a, b in zip(kept, value, strict=True)) else kept
+    return value
+
+
+def hints_of(cls: Any) -> dict[str, Any]:
     """The types of a dataclass's fields; those of steps and discounts keep what they are called."""
-    return get_type_hints(cls, include_extras=True)
+    if cls not in _HINTS:
+        _HINTS[cls] = get_type_hints(cls, include_extras=True)
+    return _HINTS[cls]
 
 
 def convert(
@@ -72,8 +105,7 @@ def convert(
         (1.0, 2.5)
     """
     origin, args = get_origin(hint), get_args(hint)
-    if getattr(value, "shape", None) == () and callable(getattr(value, "item", None)):
-        value = value.item()
+    value = plain(value)
     if origin is Annotated:  # of a text of seconds or a number, which has checks of its own
         return value
     if origin in (Union, types.UnionType):
@@ -89,6 +121,8 @@ def convert(
             key: convert(args[1], item, join(path, key), read, infinite=infinite)
             for key, item in items.items()
         }
+    if origin is Callable:
+        return _expect(callable(value), "a function", value, path)
     if is_dataclass(hint):
         if read is not None and not isinstance(value, hint):  # type: ignore[arg-type]
             return read(hint, value, path)  # type: ignore[arg-type]
