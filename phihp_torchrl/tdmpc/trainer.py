@@ -40,7 +40,7 @@ from phihp_torchrl.trainers import (
     random_policy,
     register_phase,
 )
-from phihp_torchrl.worlds import make_world
+from phihp_torchrl.worlds import check_env, make_world
 
 UNIT_UPDATES = 500
 """Updates in a unit of work, after which a run can be checkpointed."""
@@ -149,6 +149,7 @@ class TDMPCTrainer:
         self.seed = seed
         self.world = make_world(task, world)
         self.env = self.world.make_env()
+        check_env(task, self.env)
         self.generator = torch.Generator().manual_seed(seed)
         self.told = TOLD.for_task(task, config.learn.told)
         self.update = TDMPCUpdate(self.told, config.learn, compile=compile)

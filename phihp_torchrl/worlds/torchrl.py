@@ -122,14 +122,7 @@ def fit_env(task: Task, env: EnvBase) -> EnvBase:
         ConfigError: if it does not fit; the message names the key, what was expected of it and what
             was found.
     """
-    if env.batch_size:
-        raise ConfigError("world", f"expected batch size [], got {list(env.batch_size)}.")
-    _check_observation(task, env)
-    _check_action(task, env)
-    reward = env.full_reward_spec.get("reward", None)
-    if reward is None or reward.shape.numel() != 1:
-        found = "none" if reward is None else f"shape {list(reward.shape)}"
-        raise ConfigError("world", f"expected a 'reward' of one number, got {found}.")
+    check_keys(task, env)
     transforms = []
     doubles = [
         key
@@ -146,6 +139,23 @@ def fit_env(task: Task, env: EnvBase) -> EnvBase:
     if task.limits.ends_episodes:
         transforms.append(ConstraintEnd(task))
     return TransformedEnv(env, Compose(*transforms)) if transforms else env
+
+
+def check_keys(task: Task, env: EnvBase) -> None:
+    """Refuse an environment whose batch size, observation, action or reward are not the task's.
+
+    Raises:
+        ConfigError: if it does not fit; the message names the key, what was expected of it and what
+            was found.
+    """
+    if env.batch_size:
+        raise ConfigError("world", f"expected batch size [], got {list(env.batch_size)}.")
+    _check_observation(task, env)
+    _check_action(task, env)
+    reward = env.full_reward_spec.get("reward", None)
+    if reward is None or reward.shape.numel() != 1:
+        found = "none" if reward is None else f"shape {list(reward.shape)}"
+        raise ConfigError("world", f"expected a 'reward' of one number, got {found}.")
 
 
 def import_object(key: str, name: str) -> Any:
