@@ -131,8 +131,8 @@ def test_every_public_name_has_a_docstring_with_an_example() -> None:
     assert bare == set()
 
 
-def test_there_are_at_most_170_public_names() -> None:
-    assert len({name for names in public_names().values() for name in names}) <= 170
+def test_there_are_at_most_171_public_names() -> None:
+    assert len({name for names in public_names().values() for name in names}) <= 171
 
 
 def test_names_at_the_top_are_public_in_their_folder() -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from phihp_torchrl.config import (
     check_count,
+    check_fields,
     check_not_negative,
     check_positive,
     check_positive_share,
@@ -56,10 +57,9 @@ class AnalyticConfig:
     norm_limit: float = 1.0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_count(self, "horizon", "critic_updates")
         check_share(self, "trace")
         check_not_negative(self, "noise", "entropy")
-        check_positive(
-            self, "actor_learning_rate", "critic_learning_rate", "step_limit", "norm_limit"
-        )
-        check_positive_share(self, "tau")
+        check_positive(self, "step_limit", "norm_limit")
+        check_positive_share(self, "actor_learning_rate", "critic_learning_rate", "tau")

@@ -18,7 +18,15 @@ from phihp_torchrl.agents.equations import (
     q_values,
 )
 from phihp_torchrl.compilation import compile_graph
-from phihp_torchrl.config import Steps, check_count, check_positive, check_steps, resolve_seconds
+from phihp_torchrl.config import (
+    Steps,
+    check_count,
+    check_fields,
+    check_memory,
+    check_positive_share,
+    check_steps,
+    resolve_seconds,
+)
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Rollouts, finite_transition
 from phihp_torchrl.tasks import ActionBounds
@@ -64,10 +72,13 @@ class RefitConfig:
     learning_rate: float = 1e-3
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_steps(self, "horizon")
         check_count(self, "transitions", "steps", "batch_size")
         check_count(self, "start", "interval", least=0)
-        check_positive(self, "learning_rate")
+        check_positive_share(self, "learning_rate")
+        check_memory(self, "transitions", "horizon")
+        check_memory(self, "batch_size")
 
     def is_due(self, updates: int, total: int) -> bool:
         """Whether the critics are fitted after ``updates`` of ``total`` updates."""

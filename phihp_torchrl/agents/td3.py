@@ -25,8 +25,8 @@ from phihp_torchrl.config import (
     Steps,
     check_count,
     check_discount,
+    check_fields,
     check_not_negative,
-    check_positive,
     check_positive_share,
     check_steps,
     check_widths,
@@ -82,8 +82,9 @@ such as '5 s', got 1.5.
     value_expansion: Steps = 1
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_widths(self, "actor_hidden_sizes", "critic_hidden_sizes")
-        check_positive(self, "actor_learning_rate", "critic_learning_rate")
+        check_positive_share(self, "actor_learning_rate", "critic_learning_rate")
         check_count(self, "policy_delay")
         check_steps(self, "value_expansion")
         check_discount(self, "gamma")

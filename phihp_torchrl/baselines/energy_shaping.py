@@ -13,7 +13,7 @@ from phihp_torchrl.baselines.controller import Controller
 from phihp_torchrl.baselines.energy import Energy, find_energy
 from phihp_torchrl.baselines.lqr import LQR
 from phihp_torchrl.baselines.point import physical_step
-from phihp_torchrl.config import ConfigError, check_not_negative, check_positive
+from phihp_torchrl.config import ConfigError, check_fields, check_not_negative, check_positive
 from phihp_torchrl.tasks import Task
 
 
@@ -40,6 +40,7 @@ class PumpConfig:
     cart_damping: float = 0.7
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_positive(self, "gain", "cart_reach")
         check_not_negative(self, "excess", "cart_stiffness", "cart_damping")
 

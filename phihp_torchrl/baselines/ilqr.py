@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from phihp_torchrl.baselines.control_problem import ControlProblem, Expansion, Trajectory
 from phihp_torchrl.baselines.controller import Controller
 from phihp_torchrl.baselines.lqr import LQR
-from phihp_torchrl.config import ConfigError, check_count, check_positive
+from phihp_torchrl.config import ConfigError, check_count, check_fields, check_positive
 from phihp_torchrl.tasks import Task
 
 _HELD = 8
@@ -46,6 +46,7 @@ class ILQRConfig:
     damping: float = 1e-3
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_count(self, "horizon", "rounds", "first_rounds", "guesses")
         check_positive(self, "damping")
         if not self.step_sizes or not all(0.0 < size <= 1.0 for size in self.step_sizes):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from phihp_torchrl.commands.words import run_command
-from phihp_torchrl.config import ConfigError, check_choice, check_count
+from phihp_torchrl.config import ConfigError, check_choice, check_count, check_fields
 
 if TYPE_CHECKING:
     from phihp_torchrl.deployment import Agent
@@ -54,6 +54,7 @@ class PlayConfig:
     compile: bool = False
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_choice(self, "planner", (True, False, "both"))
         check_count(self, "episodes", "threads")
         check_count(self, "seed", "latency_actions", least=0)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from phihp_torchrl.commands.words import run_command
-from phihp_torchrl.config import ConfigError, check_count, check_positive
+from phihp_torchrl.config import ConfigError, check_count, check_fields, check_positive
 
 _FORMATS = ("aoti", "onnx", "c")
 _PARTS = ("plan", "actor")
@@ -48,6 +48,7 @@ class ExportConfig:
     tolerance: float = 1e-3
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for key, known in (("formats", _FORMATS), ("parts", _PARTS)):
             if unknown := [name for name in getattr(self, key) if name not in known]:
                 raise ConfigError(key, f"expected some of {list(known)}, got {unknown}.")

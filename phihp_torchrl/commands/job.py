@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Sequence
 
@@ -16,7 +15,6 @@ from phihp_torchrl.config import (
     ConfigError,
     compose_yaml,
     open_mappings,
-    override_lines,
     publish_offers,
 )
 from phihp_torchrl.evaluation import controllers_table, returns_table
@@ -25,6 +23,7 @@ from phihp_torchrl.trainers import (
     read_controllers,
     read_request,
     read_result,
+    resume_command,
     run,
 )
 
@@ -64,8 +63,8 @@ def job(composed: DictConfig) -> None:
 def tell(result: RunResult) -> None:
     """Print the table of returns, or how to resume a run that was stopped."""
     if result.signal is not None and not result.finished:
-        words = ["phihp", "train", *override_lines({"resume": str(result.path)})]
-        print(f"\nStopped. Go on with: {shlex.join(words)}")  # noqa: T201 (a console command)
+        command = resume_command(result.path)
+        print(f"\nStopped. Go on with: {command}")  # noqa: T201 (a console command)
         sys.exit(128 + result.signal)
     earned = read_result(result.path)
     if earned is not None:

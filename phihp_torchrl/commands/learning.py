@@ -11,7 +11,7 @@ from phihp_torchrl.commands.words import read_lines
 from phihp_torchrl.config import ConfigError, kind_mapping, load_config, override_lines
 from phihp_torchrl.deployment import Agent, load_agent
 from phihp_torchrl.tasks import Task, list_tasks, register_task
-from phihp_torchrl.trainers import RunDirectory, read_run_config, run, task_of
+from phihp_torchrl.trainers import RunDirectory, read_run_config, resume_command, run, task_of
 from phihp_torchrl.worlds import WORLDS, GivenConfig, World, make_world
 
 
@@ -110,7 +110,7 @@ def learn(
         run_dir = settings.get("run_dir")
     result = run(read_run_config(settings), run_dir, world=reality)
     if not result.finished:
-        raise RuntimeError(f"stopped by a signal; go on with: phihp train resume={result.path}")
+        raise RuntimeError(f"stopped by a signal; go on with: {resume_command(result.path)}")
     directory = RunDirectory(result.path)
     if not directory.agent.is_dir():
         raise ConfigError("phases", "expected 'evaluate' among them, which saves the agent.")

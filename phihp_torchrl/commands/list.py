@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from phihp_torchrl.commands.words import run_command
-from phihp_torchrl.config import METHODS, YAML
+from phihp_torchrl.config import METHODS, YAML, check_fields
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,9 @@ class ListConfig:
     """
 
     plugins: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 def main(words: Sequence[str]) -> None:

@@ -6,8 +6,10 @@ Nothing in this folder imports torch, so that settings can be read and printed w
 from __future__ import annotations
 
 from phihp_torchrl.config.checks import (
+    LARGEST_FLOAT32,
     check_choice,
     check_count,
+    check_memory,
     check_not_negative,
     check_positive,
     check_positive_share,
@@ -28,6 +30,7 @@ from phihp_torchrl.config.compose import (
     override_lines,
     parse_overrides,
 )
+from phihp_torchrl.config.convert import INFINITE, check_fields, plain, plain_fields
 from phihp_torchrl.config.durations import (
     Discount,
     Steps,

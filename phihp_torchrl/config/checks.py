@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection
+from itertools import pairwise
 from typing import Any
 
 from phihp_torchrl.config.errors import ConfigError
+
+LARGEST_FLOAT32 = 3.4028234663852886e38
+"""The largest finite number in float32, in which everything is computed."""
 
 
 def check_positive(config: object, *names: str) -> None:
@@ -26,7 +30,7 @@ def check_positive(config: object, *names: str) -> None:
         ...
         phihp_torchrl.config.ConfigError: rate: expected a positive number, got 0.0.
     """
-    _check(config, names, "a positive number", lambda value: 0 < value < math.inf)
+    _check(config, names, "a positive number", lambda value: _is_number(value) and value > 0)
 
 
 def check_not_negative(config: object, *names: str) -> None:
@@ -42,7 +46,7 @@ def check_not_negative(config: object, *names: str) -> None:
         ...
         phihp_torchrl.config.ConfigError: start: expected a number >= 0, got -1.
     """
-    _check(config, names, "a number >= 0", lambda value: 0 <= value < math.inf)
+    _check(config, names, "a number >= 0", lambda value: _is_number(value) and value >= 0)
 
 
 def check_share(config: object, *names: str) -> None:
@@ -58,7 +62,7 @@ def check_share(config: object, *names: str) -> None:
         ...
         phihp_torchrl.config.ConfigError: decay: expected a number in [0, 1], got 1.5.
     """
-    _check(config, names, "a number in [0, 1]", lambda value: 0 <= value <= 1)
+    _check(config, names, "a number in [0, 1]", lambda value: _is_number(value) and 0 <= value <= 1)
 
 
 def check_positive_share(config: object, *names: str) -> None:
@@ -74,7 +78,7 @@ def check_positive_share(config: object, *names: str) -> None:
         ...
         phihp_torchrl.config.ConfigError: gamma: expected a number in (0, 1], got 0.0.
     """
-    _check(config, names, "a number in (0, 1]", lambda value: 0 < value <= 1)
+    _check(config, names, "a number in (0, 1]", lambda value: _is_number(value) and 0 < value <= 1)
 
 
 def check_count(config: object, *names: str, least: int = 1, most: str | None = None) -> None:
@@ -125,7 +129,8 @@ def check_choice(config: object, name: str, choices: Collection[Any]) -> None:
 def check_widths(config: object, *names: str) -> None:
     """Refuse a field that is not a list of 1 to 32 layer widths, each of 1 to 65,536 units.
 
-    The upper limits keep a damaged or hostile file from asking for all memory.
+    The upper limits, and one of 2**28 weights between the layers, which are 1 GB, keep a wrong,
+    damaged or hostile file from asking for all memory.
 
     Raises:
         ConfigError: for the first such field.
@@ -143,6 +148,7 @@ def check_widths(config: object, *names: str) -> None:
             isinstance(value, (list, tuple))
             and 1 <= len(value) <= 32
             and all(is_whole(width, 1) and width <= 65_536 for width in value)
+            and sum(a * b for a, b in pairwise(value)) <= 2**28
         )
 
     _check(config, names, "1 to 32 widths up to 65536", good)
@@ -156,6 +162,44 @@ def is_whole(value: Any, least: int) -> bool:
         (True, False, False)
     """
     return isinstance(value, int) and not isinstance(value, bool) and value >= least
+
+
+def check_memory(config: object, *names: str, each: int = 1) -> None:
+    """Refuse whole numbers whose product is the size of one tensor of more than 8 GB.
+
+    Args:
+        config: the settings.
+        names: names of the fields; one that is still a text of seconds counts as 1.
+        each: numbers in an element of the tensor.
+
+    Raises:
+        ConfigError: for a product of more than 2**31; it names the largest of the fields.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> check_memory(SimpleNamespace(horizon=10**6, candidates=500), "horizon", "candidates")
+        >>> check_memory(SimpleNamespace(horizon=10**6, candidates=5000), "horizon", "candidates")
+        Traceback (most recent call last):
+        ...
+        phihp_torchrl.config.ConfigError: horizon: expected horizon * candidates of at most \
+2147483648, else a tensor takes over 8 GB, got 5000000000.
+    """
+    sizes = {name: value for name in names if isinstance(value := getattr(config, name), int)}
+    if (size := math.prod(sizes.values())) > (most := 2**31 // each):
+        raise ConfigError(
+            max(sizes, key=lambda name: sizes[name]),
+            f"expected {' * '.join(sizes)} of at most {most}, else a tensor takes over 8 GB, "
+            f"got {size}.",
+        )
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a finite number that float32 can hold; booleans are not numbers."""
+    return (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and abs(value) <= LARGEST_FLOAT32
+    )
 
 
 def _check(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import types
-import typing
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, fields, is_dataclass
 from difflib import get_close_matches
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Any, TypeVar
 
+from phihp_torchrl.config.convert import convert, hints_of, join
 from phihp_torchrl.config.errors import ConfigError
 from phihp_torchrl.config.registry import Registry
 
@@ -54,19 +53,19 @@ def from_mapping(cls: type[T], mapping: Mapping[str, Any], path: str = "") -> T:
         if key not in known:
             close = get_close_matches(str(key), known, n=1)
             hint = f"did you mean {close[0]!r}?" if close else f"expected one of {sorted(known)}."
-            raise ConfigError(_join(path, key), f"unknown key; {hint}")
-    hints = typing.get_type_hints(cls)
+            raise ConfigError(join(path, key), f"unknown key; {hint}")
+    hints = hints_of(cls)
     values = {}
     for key, f in known.items():
         if mapping.get(key, MISSING_VALUE) != MISSING_VALUE:
-            where = _join(path, key)
+            where = join(path, key)
             kinds = f.metadata.get("kinds")
             if kinds is not None and mapping[key] is not None:
                 values[f.name] = read_kind(kinds, mapping[key], where)
             else:
-                values[f.name] = _convert(hints[f.name], mapping[key], where)
+                values[f.name] = convert(hints[f.name], mapping[key], where, from_mapping)
         elif f.default is MISSING and f.default_factory is MISSING:
-            raise ConfigError(_join(path, key), f"missing: expected {key}=...; it has no default.")
+            raise ConfigError(join(path, key), f"missing: expected {key}=...; it has no default.")
     try:
         return cls(**values)
     except ConfigError as error:
@@ -89,7 +88,7 @@ def read_kind(kinds: Registry[Any], mapping: Mapping[str, Any], path: str) -> An
     rest = dict(mapping)
     name = rest.pop(KIND, None) or next(iter(kinds))
     if name not in kinds:
-        raise ConfigError(_join(path, KIND), f"expected one of {sorted(kinds)}, got {name!r}.")
+        raise ConfigError(join(path, KIND), f"expected one of {sorted(kinds)}, got {name!r}.")
     return from_mapping(kinds[name].config, rest, path)
 
 
@@ -125,7 +124,7 @@ def differences(ours: Any, theirs: Any, path: str = "") -> list[tuple[str, Any, 
     if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
         keys = [*ours, *(key for key in theirs if key not in ours)]
         pairs = ((key, ours.get(key), theirs.get(key)) for key in keys)
-        return [found for key, a, b in pairs for found in differences(a, b, _join(path, key))]
+        return [found for key, a, b in pairs for found in differences(a, b, join(path, key))]
     return [] if ours == theirs else [(path, ours, theirs)]
 
 
@@ -151,7 +150,7 @@ def flatten(mapping: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     """
     flat: dict[str, Any] = {}
     for key, value in mapping.items():
-        name = _join(path, key)
+        name = join(path, key)
         flat |= flatten(value, name) if isinstance(value, Mapping) and value else {name: value}
     return flat
 
@@ -160,64 +159,9 @@ def _key(f: Field) -> str:
     return f.metadata.get("key", f.name)
 
 
-def _join(path: str, key: object) -> str:
-    return f"{path}.{key}" if path else str(key)
-
-
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         return to_mapping(value)
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     return [_plain(item) for item in value] if isinstance(value, (list, tuple)) else value
-
-
-def _convert(hint: Any, value: Any, path: str) -> Any:
-    """Convert ``value`` to the type ``hint``, or raise a ConfigError that names ``path``."""
-    origin, args = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        return _convert_union(args, value, path)
-    if origin is Literal:
-        return _expect(value in args, f"one of {list(args)}", value, path)
-    if origin is tuple:
-        items = _expect(isinstance(value, (list, tuple)), "a list", value, path)
-        if args[-1] is not Ellipsis and len(items) != len(args):
-            raise ConfigError(path, f"expected {len(args)} values, got {value!r}.")
-        of = args[:1] * len(items) if args[-1] is Ellipsis else args
-        pairs = enumerate(zip(of, items, strict=True))
-        return tuple(_convert(item_hint, item, f"{path}[{i}]") for i, (item_hint, item) in pairs)
-    if origin is not None and issubclass(origin, Mapping):
-        items = _expect(isinstance(value, Mapping), "keys and values", value, path)
-        return {key: _convert(args[1], item, _join(path, key)) for key, item in items.items()}
-    if is_dataclass(hint):
-        return from_mapping(hint, value, path)  # type: ignore[arg-type]
-    if hint is float:
-        number = isinstance(value, (int, float)) and not isinstance(value, bool)
-        return float(_expect(number, "a number", value, path))
-    if hint is int:
-        whole = isinstance(value, int) and not isinstance(value, bool)
-        return _expect(whole, "a whole number", value, path)
-    if hint in (bool, str):
-        name = {bool: "true or false", str: "a text"}[hint]
-        return _expect(isinstance(value, hint), name, value, path)
-    return value
-
-
-def _convert_union(hints: tuple[Any, ...], value: Any, path: str) -> Any:
-    if value is None and type(None) in hints:
-        return None
-    errors = []
-    for hint in hints:
-        if hint is type(None):
-            continue
-        try:
-            return _convert(hint, value, path)
-        except ConfigError as error:
-            errors.append(error)
-    raise errors[0]
-
-
-def _expect(good: bool, expected: str, value: Any, path: str) -> Any:
-    if not good:
-        raise ConfigError(path, f"expected {expected}, got {value!r}.")
-    return value

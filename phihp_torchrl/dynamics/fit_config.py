@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from phihp_torchrl.config import ConfigError, check_choice, check_count, check_positive
+from phihp_torchrl.config import (
+    ConfigError,
+    check_choice,
+    check_count,
+    check_fields,
+    check_positive,
+    check_positive_share,
+)
 
 METHODS = ("levenberg_marquardt", "multiple_shooting", "adam")
 """The methods of a fit, by the name that settings use."""
@@ -65,9 +72,11 @@ class FitConfig:
     robust: float | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_choice(self, "method", METHODS)
         check_count(self, "steps", "patience", "window")
-        check_positive(self, "learning_rate", "initial_lambda", "final_lambda")
+        check_positive(self, "initial_lambda", "final_lambda")
+        check_positive_share(self, "learning_rate")
         if self.batch_size is not None:
             check_count(self, "batch_size")
         if self.robust is not None:

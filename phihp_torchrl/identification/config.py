@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from phihp_torchrl.config import ConfigError, check_choice, check_count, is_whole
+from phihp_torchrl.config import ConfigError, check_choice, check_count, check_fields, is_whole
 
 Auto = Literal["auto"]
 AUTO: Auto = "auto"
@@ -60,6 +60,7 @@ class IdentifyConfig:
     stops: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_count(self, "window", "past", least=8)
         check_count(self, "windows", least=4)
         check_count(self, "largest_delay", "substeps", least=0)

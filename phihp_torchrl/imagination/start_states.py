@@ -10,7 +10,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_not_negative
+from phihp_torchrl.config import ConfigError, check_fields, check_not_negative
 from phihp_torchrl.tasks import Box, Task
 
 
@@ -212,6 +212,7 @@ class StartConfig:
     goal: float = 0.2
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_not_negative(self, "reset", "data", "coverage", "goal")
 
 

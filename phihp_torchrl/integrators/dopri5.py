@@ -6,8 +6,11 @@ import torch
 from torch import Tensor
 from torchdiffeq import odeint
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import check_positive
 from phihp_torchrl.integrators.base import Derivative, Integrator, StateLayout, TimeStep
+
+_BOUND = 1e15
+"""Beyond it, in any unit, a state or its rate of change has run away."""
 
 
 class Dopri5(Integrator):
@@ -20,14 +23,15 @@ class Dopri5(Integrator):
     Inner steps are never shorter than a hundredth of the control step: dry friction jumps where a
     velocity changes sign, and a cart that sticks there would need a hundred thousand inner steps.
 
+    A state that is not finite, or that runs away beyond 1e15 or at a rate beyond it, becomes NaN
+    and leaves the rest of the batch alone, so that a planner's candidate that diverges loses.
+
     Args:
         rtol: relative tolerance of an inner step.
         atol: absolute tolerance of an inner step, in the units of the state.
 
     Raises:
         ConfigError: for tolerances that are not positive.
-        ValueError: on a call, when any state of the batch
-            is or becomes non-finite.
 
     Examples:
         >>> grow = Dopri5()(lambda s: s, torch.ones(1), 1.0, StateLayout(size=1))
@@ -39,10 +43,9 @@ class Dopri5(Integrator):
     compiles = False
 
     def __init__(self, rtol: float = 1e-6, atol: float = 1e-8) -> None:
-        if not (rtol > 0 and atol > 0):
-            raise ConfigError("rtol, atol", f"expected positive tolerances, got {rtol}, {atol}.")
         self.rtol = rtol
         self.atol = atol
+        check_positive(self, "rtol", "atol")
 
     def __call__(
         self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
@@ -50,16 +53,28 @@ class Dopri5(Integrator):
         # Time steps that differ are brought to the same unit interval by the speed of the motion.
         length, speed = (1.0, time_step) if isinstance(time_step, Tensor) else (time_step, 1.0)
         times = torch.tensor([0.0, length], dtype=state.dtype, device=state.device)
-        try:
-            trajectory = odeint(
-                lambda _, s: speed * derivative(s),
-                state,
-                times,
-                method="dopri5",
-                rtol=self.rtol,
-                atol=self.atol,
-                options={"min_step": 0.01 * length},
-            )
-        except AssertionError as error:  # torchdiffeq raises these for non-finite values
-            raise ValueError(f"state: expected finite values while solving; {error}.") from error
-        return layout.clip(trajectory[-1])
+        # torchdiffeq refuses the whole batch for one value that is not finite, so a state that runs
+        # away stands still from there on.
+        lost = ~_is_bounded(state)
+
+        def bounded(_: Tensor, s: Tensor) -> Tensor:
+            nonlocal lost
+            rate = speed * derivative(s)
+            lost = lost | ~(_is_bounded(s) & _is_bounded(rate))
+            return torch.where(lost, torch.zeros_like(rate), rate)
+
+        trajectory = odeint(
+            bounded,
+            torch.where(lost, torch.zeros_like(state), state),
+            times,
+            method="dopri5",
+            rtol=self.rtol,
+            atol=self.atol,
+            options={"min_step": 0.01 * length},
+        )
+        return layout.clip(trajectory[-1]).masked_fill(lost, torch.nan)
+
+
+def _is_bounded(values: Tensor) -> Tensor:
+    """Whether all components of each row are finite and below the bound, ``[*batch, 1]``."""
+    return (values.abs() <= _BOUND).all(-1, keepdim=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -13,11 +14,11 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import MPCPlannerBase
 
 from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.config import refuse_seconds
+from phihp_torchrl.planners.deterministic import deterministic, reads_exploration_type
 from phihp_torchrl.planners.env_model import (
     EnvModel,
     find_action,
@@ -281,7 +282,9 @@ class SamplingPlanner(MPCPlannerBase):
             observation = tensordict.get(self.observation_key)
         else:
             observation = tensordict.select(*self.in_keys)
-        with set_exploration_type(ExplorationType.DETERMINISTIC):
+        # Our own modules do not read the exploration type, which belongs to the whole process.
+        plain = self.uses_tensors and not reads_exploration_type(self)
+        with nullcontext() if plain else deterministic():
             return self._planning_functions[shapes](observation, *args)
 
     def _starts(self, tensordict: TensorDictBase) -> Tensor | None:

@@ -11,6 +11,8 @@ from phihp_torchrl.config import (
     check_choice,
     check_count,
     check_discount,
+    check_fields,
+    check_memory,
     check_not_negative,
     check_positive,
     check_steps,
@@ -76,8 +78,10 @@ class SearchConfig:
     tail_dtype: str = "float32"
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_steps(self, "planning_horizon")
         check_count(self, "optim_steps", "num_candidates")
+        check_memory(self, "optim_steps", "planning_horizon", "num_candidates")
         check_count(self, "top_k", most="num_candidates")
         check_count(self, "num_policy_candidates", least=0, most="num_candidates")
         check_not_negative(self, "policy_noise", "policy_noise_clip", "min_std", "alpha")

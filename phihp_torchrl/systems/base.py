@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, plain, plain_fields
 from phihp_torchrl.integrators import StateLayout
 from phihp_torchrl.systems.layout import make_layout
 
@@ -49,6 +49,7 @@ class Constant:
     fixed: bool = False
 
     def __post_init__(self) -> None:
+        plain_fields(self)
         if not (math.isfinite(self.guess) and math.isfinite(self.low)):
             raise ConfigError("guess", f"expected finite numbers, got {self}.")
         if self.high == math.inf and self.low != 0.0 and not self.fixed:
@@ -279,4 +280,7 @@ def override(
     unknown = sorted(set(changes) - set(defaults))
     if unknown:
         raise ConfigError(what, f"unknown {unknown}, expected some of {sorted(defaults)}.")
+    for name, value in changes.items():
+        if isinstance(plain(value), bool) or not isinstance(plain(value), (int, float)):
+            raise ConfigError(f"{what}.{name}", f"expected a number, got {value!r}.")
     return {name: float(changes.get(name, value)) for name, value in defaults.items()}

@@ -9,6 +9,7 @@ from phihp_torchrl.tasks.bounds import ActionBounds
 from phihp_torchrl.tasks.box import Box
 from phihp_torchrl.tasks.constraint import Constraint
 from phihp_torchrl.tasks.disturbance import Disturbance, DisturbancePart
+from phihp_torchrl.tasks.dry_run import check_functions
 from phihp_torchrl.tasks.last_action import LastAction
 from phihp_torchrl.tasks.numbers import Numbers
 from phihp_torchrl.tasks.registers import Part, Registers

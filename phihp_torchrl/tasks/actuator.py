@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from phihp_torchrl.config import plain_fields
 from phihp_torchrl.tasks.numbers import Numbers, check_each, one_each, read_numbers
 from phihp_torchrl.tasks.registers import Seconds, follow
 
@@ -58,6 +59,7 @@ class Actuator:
     gain_low: Numbers = 1.0
 
     def __post_init__(self) -> None:
+        plain_fields(self)
         for f in fields(self):
             value = getattr(self, f.name)
             if f.name == "slew" and value is None:

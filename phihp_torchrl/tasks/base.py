@@ -7,8 +7,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from phihp_torchrl.config import (
+    INFINITE,
     ConfigError,
     check_count,
+    check_fields,
     check_not_negative,
     check_positive,
     from_mapping,
@@ -102,9 +104,11 @@ class Task(Steps):
     reward: RewardFn
     terminated: TerminatedFn | None = None
     velocity_limits: Mapping[str, float | tuple[float, float]] = field(
-        default_factory=dict, hash=False
+        default_factory=dict, hash=False, metadata=INFINITE
     )
-    position_limits: Mapping[str, tuple[float, float]] = field(default_factory=dict, hash=False)
+    position_limits: Mapping[str, tuple[float, float]] = field(
+        default_factory=dict, hash=False, metadata=INFINITE
+    )
     restitution: float | Mapping[str, float] = field(default=0.0, hash=False)
     coverage: Box | None = None
     goal: Box | None = None
@@ -131,6 +135,9 @@ class Task(Steps):
     )
 
     def __post_init__(self) -> None:
+        check_fields(self)
+        if not isinstance(self.system, System):
+            raise ConfigError("system", f"expected a System, got {self.system!r}.")
         self._set_bounds()
         check_positive(self, "time_step")
         check_count(self, "max_steps")

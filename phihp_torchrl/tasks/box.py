@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import LARGEST_FLOAT32, ConfigError, check_fields
 
 
 @dataclass(frozen=True)
@@ -31,10 +30,11 @@ class Box:
     high: tuple[float, ...]
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if len(self.low) != len(self.high):
             raise ConfigError("low, high", f"expected equal lengths, got {self.low}, {self.high}.")
         pairs = zip(self.low, self.high, strict=True)
-        if any(not -math.inf < low <= high < math.inf for low, high in pairs):
+        if any(not (low <= high and high - low <= LARGEST_FLOAT32) for low, high in pairs):
             raise ConfigError(
                 "low, high", f"expected finite low <= high, got {self.low}, {self.high}."
             )

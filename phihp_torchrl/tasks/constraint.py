@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, plain_fields
 from phihp_torchrl.tasks.outside import named
 
 ConstrainedFn = Callable[..., Tensor]
@@ -59,6 +59,7 @@ class Constraint:
     function: ConstrainedFn | None = field(default=None)
 
     def __post_init__(self) -> None:
+        plain_fields(self)
         if not isinstance(self.name, str) or not self.name:
             raise ConfigError("constraints.name", f"expected a name, got {self.name!r}.")
         for key in ("low", "high", "price"):

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_positive
+from phihp_torchrl.config import ConfigError, check_positive, plain_fields
 from phihp_torchrl.systems import System
 from phihp_torchrl.tasks.registers import Part, Seconds
 
@@ -57,6 +57,7 @@ class Disturbance:
     time: float = 0.2
 
     def __post_init__(self) -> None:
+        plain_fields(self)
         check_positive(self, "time")
         if not isinstance(self.high, Mapping) or not self.high:
             raise ConfigError("high", f"expected drifts by name of a state, got {self.high!r}.")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, plain
 
 Numbers = float | tuple[float, ...]
 """One number for every action, or one number each."""
@@ -27,10 +27,12 @@ def read_numbers(key: str, value: Any, *, positive: bool = False) -> Numbers:
         >>> read_numbers("lag", [1, 2])
         (1.0, 2.0)
     """
+    value = plain(value)
     listed = isinstance(value, (tuple, list))
     numbers = tuple(value) if listed else (value,)
     for number in numbers:
-        known = isinstance(number, (int, float)) and math.isfinite(number)
+        known = isinstance(number, (int, float)) and not isinstance(number, bool)
+        known = known and math.isfinite(number)
         if not known or number < 0 or (positive and number == 0):
             expected = "above 0" if positive else "of at least 0"
             raise ConfigError(key, f"expected numbers {expected}, got {value!r}.")

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, is_whole
+from phihp_torchrl.config import ConfigError, is_whole, plain_fields
 from phihp_torchrl.tasks.trajectories import Sampler, Trajectories
 
 
@@ -49,6 +49,7 @@ class Signal:
     sampler: Sampler | Trajectories = field(default_factory=Trajectories)
 
     def __post_init__(self) -> None:
+        plain_fields(self)
         object.__setattr__(self, "names", tuple(self.names))
         if not self.names or len(set(self.names)) < len(self.names):
             raise ConfigError("names", f"expected different names, got {self.names}.")

@@ -17,6 +17,7 @@ from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.config import (
     Discount,
     check_discount,
+    check_fields,
     check_not_negative,
     check_positive_share,
 )
@@ -63,6 +64,7 @@ class TDMPCLossConfig:
     output_penalty: float = 0.005
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_discount(self, "gamma")
         check_positive_share(self, "rho")
         coefficients = [f"{name}_coef" for name in ("consistency", "reward", "value")]

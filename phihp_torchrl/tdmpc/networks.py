@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torchrl.modules import MLP
 
-from phihp_torchrl.config import ConfigError, check_count
+from phihp_torchrl.config import ConfigError, check_count, check_fields
 from phihp_torchrl.tasks import ActionBounds, Task
 
 _WIDEST = 65_536
@@ -35,6 +35,7 @@ class TOLDConfig:
     mlp_dim: int = 128
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_count(self, "latent_dim", "encoder_dim", "mlp_dim")
         for name, value in vars(self).items():
             if value > _WIDEST:

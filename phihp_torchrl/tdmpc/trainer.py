@@ -16,6 +16,8 @@ from phihp_torchrl.config import (
     ConfigError,
     Steps,
     check_count,
+    check_fields,
+    check_memory,
     check_not_negative,
     check_positive,
     check_share,
@@ -38,7 +40,7 @@ from phihp_torchrl.trainers import (
     random_policy,
     register_phase,
 )
-from phihp_torchrl.worlds import make_world
+from phihp_torchrl.worlds import check_env, make_world
 
 UNIT_UPDATES = 500
 """Updates in a unit of work, after which a run can be checkpointed."""
@@ -91,8 +93,11 @@ horizon=5, got 9.
     planner: ScheduledMPPIConfig = field(default_factory=ScheduledMPPIConfig)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_steps(self, "horizon")
-        check_count(self, "real_steps", "batch_size", "evaluation_interval")
+        check_count(self, "real_steps", "batch_size", "replay_capacity", "evaluation_interval")
+        check_memory(self, "horizon", "batch_size", each=16)
+        check_memory(self, "replay_capacity", each=16)
         check_count(self, "seed_steps", "evaluation_episodes", least=0)
         check_not_negative(self, "priority_alpha", "priority_beta")
         check_positive(self, "updates_per_step")
@@ -144,6 +149,7 @@ class TDMPCTrainer:
         self.seed = seed
         self.world = make_world(task, world)
         self.env = self.world.make_env()
+        check_env(task, self.env)
         self.generator = torch.Generator().manual_seed(seed)
         self.told = TOLD.for_task(task, config.learn.told)
         self.update = TDMPCUpdate(self.told, config.learn, compile=compile)

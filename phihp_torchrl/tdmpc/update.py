@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from phihp_torchrl.config import check_count, check_positive, check_positive_share
+from phihp_torchrl.config import check_count, check_fields, check_positive, check_positive_share
 from phihp_torchrl.tdmpc.loss import TDMPCLoss, TDMPCLossConfig
 from phihp_torchrl.tdmpc.networks import TOLD, TOLDConfig
 
@@ -48,7 +48,9 @@ class TDMPCConfig:
     loss: TDMPCLossConfig = field(default_factory=TDMPCLossConfig)
 
     def __post_init__(self) -> None:
-        check_positive(self, "learning_rate", "critic_learning_rate", "max_grad_norm")
+        check_fields(self)
+        check_positive(self, "max_grad_norm")
+        check_positive_share(self, "learning_rate", "critic_learning_rate")
         check_count(self, "target_interval")
         check_positive_share(self, "tau")
 

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from phihp_torchrl.config import ConfigError, check_count, check_not_negative, is_whole
+from phihp_torchrl.config import (
+    ConfigError,
+    check_count,
+    check_fields,
+    check_not_negative,
+    is_whole,
+)
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,7 @@ class CalibrateConfig:
     budget: int = 60_000_000
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not isinstance(self.enabled, bool):
             raise ConfigError("enabled", f"expected true or false, got {self.enabled!r}.")
         check_count(self, "episodes", least=2)

@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from phihp_torchrl.config import (
     ConfigError,
     Steps,
+    check_fields,
     check_not_negative,
     check_steps,
     resolve_seconds,
@@ -68,6 +69,7 @@ class CollectConfig:
     exploration: ExplorationConfig = field(default_factory=ExplorationConfig)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_not_negative(self, "noise")
         check_steps(self, "random_hold")
         if self.random_hold != 1 and self.exploration.coloured:
@@ -156,29 +158,30 @@ def within_rate(task: Task, policy: Policy) -> Policy:
     return limited
 
 
-def drop_unusable(data: TensorDict) -> tuple[TensorDict, int]:
+def drop_unusable(data: TensorDict) -> tuple[TensorDict, int, ConfigError | None]:
     """Leave out real transitions of which a number is missing or infinite, and warn.
 
     Args:
         data: transitions ``[N]`` in order, with ``"done"`` under ``"next"``.
 
     Returns:
-        The other transitions, in which one before a gap is ``"done"``; and how many were left out.
-
-    Raises:
-        ConfigError: if they are more than a fifth.
+        The other transitions, in which one before a gap is ``"done"``; how many were left out; and
+        the error to raise, once the others are safe, if these are more than a fifth.
     """
     keys = ("observation", "action", ("next", "observation"), ("next", "reward"))
     usable = torch.stack([data[key].isfinite().all(-1) for key in keys]).all(0)
     dropped = int((~usable).sum())
     if not dropped:
-        return data, 0
+        return data, 0, None
     bad = [str(key) for key in keys if not data[key].isfinite().all()]
+    refusal = None
     if dropped > _TOO_MANY * len(data):
-        raise ConfigError(
+        first = int((~usable).nonzero()[0])
+        refusal = ConfigError(
             "world",
             f"{dropped} of {len(data)} real steps have missing or infinite numbers in {bad}, more "
-            f"than {_TOO_MANY:.0%}; look at the sensor or the environment.",
+            f"than {_TOO_MANY:.0%}, the first at step {first}; look at the sensor or the "
+            "environment. The other steps are kept, and a resumed run goes on with them.",
         )
     _log.warning(
         "%d of %d real steps are left out: missing or infinite numbers in %s.",
@@ -190,7 +193,7 @@ def drop_unusable(data: TensorDict) -> tuple[TensorDict, int]:
     done[:-1] |= ~usable[1:, None]
     data = data.clone(recurse=False)
     data["next"] = data["next"].clone(recurse=False).set("done", done)
-    return data[usable], dropped
+    return data[usable], dropped, refusal
 
 
 def planning_policy(

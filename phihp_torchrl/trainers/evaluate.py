@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from phihp_torchrl.baselines import check_names
-from phihp_torchrl.config import check_count
+from phihp_torchrl.config import check_count, check_fields
 from phihp_torchrl.deployment import Agent, save_agent
 from phihp_torchrl.evaluation import (
     BASELINES_KEY,
@@ -60,6 +60,7 @@ class EvaluateConfig:
     baselines: str | tuple[str, ...] = "auto"
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_count(self, "episodes")
         check_count(self, "first_seed", least=EVALUATION_SEED)
         check_count(self, "latency_actions", least=0)

@@ -11,7 +11,13 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_not_negative, check_positive
+from phihp_torchrl.config import (
+    INFINITE,
+    ConfigError,
+    check_fields,
+    check_not_negative,
+    check_positive,
+)
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds import import_object, read_guards
 
@@ -58,9 +64,12 @@ class ExplorationConfig:
     colour: float = 0.0
     trim: tuple[float, ...] | None = None
     controller: str | None = None
-    guards: Mapping[str, float | tuple[float, float]] = field(default_factory=dict, hash=False)
+    guards: Mapping[str, float | tuple[float, float]] = field(
+        default_factory=dict, hash=False, metadata=INFINITE
+    )
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_not_negative(self, "colour")
         if not 0 < self.amplitude <= 2:
             raise ConfigError("amplitude", f"expected a number in (0, 2], got {self.amplitude!r}.")

@@ -11,6 +11,8 @@ from typing import Any, Literal
 
 from torchrl.record.loggers import get_logger
 
+from phihp_torchrl.config import check_fields
+
 _log = logging.getLogger(__name__)
 
 REAL_STEPS = "real_steps"
@@ -42,6 +44,9 @@ class LoggerConfig:
     group: str | None = None
     tags: tuple[str, ...] = ()
     mode: Literal["online", "offline", "disabled"] | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
 
 class RunLogger:

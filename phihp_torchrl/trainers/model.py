@@ -33,7 +33,7 @@ from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
 from phihp_torchrl.trainers.model_doubts import Doubts
 from phihp_torchrl.trainers.model_fit import chooses_solver, fit_choosing, measures, solver_number
 from phihp_torchrl.trainers.phases import Phase, register_phase
-from phihp_torchrl.trainers.real_data import RealData, replay_batch
+from phihp_torchrl.trainers.real_data import RealData, Taken, replay_batch
 from phihp_torchrl.worlds import make_world
 
 
@@ -45,7 +45,8 @@ class ModelTrainer:
     once, to all their transitions.
 
     Steps of which a number is missing are left out, with a warning. A run saves new steps before it
-    fits the model to them, so that a fit that fails costs no step.
+    fits the model to them, so that a fit that fails costs no step; nor does an environment that
+    fails in the middle of an iteration, whose other steps are taken when the run is resumed.
 
     Where the task has no actuator and previous commands explain what the first or the last fit
     leaves over, a dead time and a lag are chosen by held-out error. :attr:`task` and :attr:`world`
@@ -90,7 +91,8 @@ class ModelTrainer:
         self.iteration = 0
         self.keep: Callable[[], None] | None = None
         """What saves the run; it is called when there are new real steps."""
-        self._new, self._dropped = 0, 0  # steps not yet fitted, and those left out
+        # Steps not yet fitted, those left out, and those that a failure has kept from being taken.
+        self._new, self._dropped, self._missing = 0, 0, 0
         self._doubts = Doubts()
         self._found: Actuator | None = None
         seed_of_env = self._draw_seed()
@@ -150,15 +152,8 @@ class ModelTrainer:
 
     def advance(self) -> dict[str, float]:
         """Collect once and fit once; returns metrics."""
-        if not self._new:  # else a fit has failed, and is tried again on the same steps
-            steps = min(self.config.period, self.config.real_steps - self.real_steps)
-            recorded = self.source.recorded
-            new = self.collect(steps) if recorded is None else recorded
-            self.data = new if self.data is None else torch.cat([self.data, new])
-            self.iteration += 1
-            self._new = len(new)
-            if self.keep is not None:
-                self.keep()
+        if self._missing or not self._new:  # else a fit has failed, and is tried again
+            self._take()
         assert self.data is not None
         if self.world.truth is None:
             self._doubts.of_task(self.task, self.data, self.real_steps, last=self._has_all)
@@ -173,12 +168,39 @@ class ModelTrainer:
         self._new = 0
         return {name: float(value) for name, value in metrics.items()}
 
+    def _take(self) -> None:
+        """Take the real steps of an iteration, and keep them before anything else is done.
+
+        Raises:
+            ConfigError: as :meth:`collect`, when the steps that were taken are kept.
+        """
+        failure, new = None, self.source.recorded
+        if new is None:
+            left = self.config.real_steps - self.real_steps
+            taken = self._collect(min(self._missing or self.config.period, left))
+            new, self._missing, failure = taken.data, taken.missing, taken.failure
+        self.data = new if self.data is None else torch.cat([self.data, new])
+        self._new += len(new)
+        if not self._missing:
+            self.iteration += 1
+        if self.keep is not None:
+            self.keep()
+        if failure is not None:
+            raise failure
+
     def collect(self, steps: int) -> TensorDict:
         """Take real steps: at random in the first iteration, with the planner in later ones.
 
         Raises:
-            ConfigError: for a world of recordings, and if too many steps miss a number.
+            ConfigError: for a world of recordings, if too many steps miss a number, and if the
+                environment fails.
         """
+        taken = self._collect(steps)
+        if taken.failure is not None:
+            raise taken.failure
+        return taken.data
+
+    def _collect(self, steps: int) -> Taken:
         if self.env is None:
             raise ConfigError("world", f"{self.world} has recordings alone, nobody can act in it.")
         config, generator = self.config, self.generator
@@ -192,9 +214,9 @@ class ModelTrainer:
             )
         # Each iteration has its seed, so that a resumed run has the same resets.
         seed, counts = self._draw_seed(), self.lateness.open
-        data, dropped = self.source.take(steps, policy, seed, counts=counts)
-        self._dropped += dropped
-        return data
+        taken = self.source.take(steps, policy, seed, counts=counts)
+        self._dropped += taken.dropped
+        return taken
 
     def fit(self) -> dict[str, Tensor | float]:
         """Fit the model to all data and measure it."""
@@ -256,6 +278,7 @@ class ModelTrainer:
             "iteration": self.iteration,
             "new": self._new,
             "dropped": self._dropped,
+            "missing": self._missing,
             "generator": self.generator.get_state(),
         }
 
@@ -274,6 +297,7 @@ class ModelTrainer:
         if (solver := state.get("solver")) is not None:
             self.dynamics.integrator = SOLVERS[solver]
         self._new, self._dropped = state.get("new", 0), state.get("dropped", 0)
+        self._missing = state.get("missing", 0)
         self.generator.set_state(state["generator"])
 
     def _draw_seed(self) -> int:

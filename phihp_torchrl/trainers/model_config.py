@@ -11,6 +11,7 @@ from phihp_torchrl.config import (
     ConfigError,
     check_choice,
     check_count,
+    check_fields,
     check_not_negative,
     check_positive,
     check_widths,
@@ -34,6 +35,9 @@ from phihp_torchrl.worlds import (
 )
 
 _ACTIVATIONS: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU}
+
+
+_MOST_MEMBERS = 1024
 
 
 @dataclass(frozen=True)
@@ -97,11 +101,14 @@ class ModelConfig:
     collect: CollectConfig = field(default_factory=CollectConfig)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_choice(self, "kind", ("hybrid", "data_driven", "prior", "oracle"))
         check_count(self, "real_steps", least=0 if self.kind == "oracle" else 1)
         if self.steps_per_iteration is not None:
             check_count(self, "steps_per_iteration")
         check_count(self, "refit_steps", "ensemble")
+        if self.ensemble > _MOST_MEMBERS:
+            raise ConfigError("ensemble", f"expected at most {_MOST_MEMBERS}, got {self.ensemble}.")
         if self.ensemble > 1 and self.kind not in ("hybrid", "data_driven"):
             raise ConfigError(
                 "ensemble",

@@ -14,6 +14,8 @@ from phihp_torchrl.config import (
     Steps,
     check_choice,
     check_count,
+    check_fields,
+    check_memory,
     check_not_negative,
     check_positive,
     check_share,
@@ -21,6 +23,9 @@ from phihp_torchrl.config import (
 )
 from phihp_torchrl.imagination import StartConfig
 from phihp_torchrl.trainers.learners import LEARNERS
+
+_ROW = 16
+"""Numbers of a transition in memory, about."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +105,7 @@ class PolicyConfig:
     refit: RefitConfig = field(default_factory=RefitConfig)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_count(
             self,
             "updates",
@@ -111,6 +117,9 @@ class PolicyConfig:
             "evaluation_interval",
             "evaluation_episodes",
         )
+        check_memory(self, "num_worlds", "chunk_steps")
+        for name in ("batch_size", "replay_capacity", "evaluation_episodes", "random_steps"):
+            check_memory(self, name, each=_ROW)
         check_choice(self, "method", LEARNERS)
         check_choice(self, "scales", ("auto", "none"))
         if isinstance(self.strategies, str):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from phihp_torchrl.config import ConfigError
@@ -15,12 +16,28 @@ from phihp_torchrl.imagination import Batch
 from phihp_torchrl.recordings import transitions
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.collect import Policy, drop_unusable, steady, within_rate
-from phihp_torchrl.worlds import World, command_memory, crossings_text, guard_env
+from phihp_torchrl.worlds import World, check_env, command_memory, crossings_text, guard_env
 
 _log = logging.getLogger(__name__)
 
 _SAME_STEP = 1e-3
 """Recorded time steps within this share of the task's are the task's."""
+
+
+class Taken(NamedTuple):
+    """Real steps that were taken.
+
+    Args:
+        data: the transitions of which no number is missing, ``[N]``.
+        dropped: how many others there were.
+        missing: how many steps were not taken, because the environment failed.
+        failure: the error to raise, once the data are safe; ``None`` for none.
+    """
+
+    data: TensorDict
+    dropped: int
+    missing: int
+    failure: ConfigError | None
 
 
 class RealData:
@@ -40,7 +57,9 @@ class RealData:
         """How often each guard ended an episode of the last steps."""
         self.env: EnvBase | None = None
         if world.has_env:
-            self.env = guard_env(world.make_env(), task, guards, self.crossings)
+            env = world.make_env()
+            check_env(task, env)
+            self.env = guard_env(env, task, guards, self.crossings)
         self.recorded = _recorded(world)
         """All transitions of a world that has recordings alone; ``None`` for other worlds."""
 
@@ -53,10 +72,8 @@ class RealData:
         else:
             self.recorded = _recorded(world)
 
-    def take(
-        self, steps: int, policy: Policy, seed: int, *, counts: bool = False
-    ) -> tuple[TensorDict, int]:
-        """Take real steps.
+    def take(self, steps: int, policy: Policy, seed: int, *, counts: bool = False) -> Taken:
+        """Take real steps; those before a failure of the environment are returned too.
 
         Args:
             steps: how many.
@@ -64,18 +81,14 @@ class RealData:
             seed: seed of the environment, for the states in which episodes start.
             counts: whether to keep the number of each step in its episode.
 
-        Returns:
-            The transitions of which no number is missing, and how many others there were.
-
         Raises:
-            ConfigError: if too many steps miss a number.
+            ConfigError: if the environment fails before the first step is done.
         """
         assert self.env is not None
         self.env.set_seed(seed)
         self.crossings.clear()
-        with torch.no_grad():
-            policy = within_rate(self.task, steady(self.task, policy))
-            rollout = self.env.rollout(steps, policy, break_when_any_done=False)
+        rollout, failure = self._rollout(steps, within_rate(self.task, steady(self.task, policy)))
+        missing, steps = steps - len(rollout), len(rollout)
         self._tell_crossings(steps)
         done = rollout["next", "done"].clone()
         done[-1] = True  # the next rollout starts from a reset
@@ -93,7 +106,38 @@ class RealData:
         ).detach()
         if counts:
             data["step_count"] = rollout["step_count"]
-        return drop_unusable(data)
+        data, dropped, refusal = drop_unusable(data)
+        return Taken(data, dropped, missing, failure or refusal)
+
+    def _rollout(self, steps: int, policy: Policy) -> tuple[TensorDictBase, ConfigError | None]:
+        """Real steps, and the error that ended them early."""
+        assert self.env is not None
+        done: list[TensorDictBase] = []
+        try:
+            with torch.no_grad():
+                return self.env.rollout(
+                    steps,
+                    policy,
+                    break_when_any_done=False,
+                    callback=lambda _, step: done.append(step.clone()),
+                ), None
+        except ConfigError as error:  # of a guard or a controller, which says enough
+            cause, failure = error, error
+        # Somebody else's environment may raise anything, and its steps were dear.
+        except Exception as error:
+            cause, failure = (
+                error,
+                ConfigError(
+                    "world",
+                    f"its environment failed at step {len(done)} of {steps}: "
+                    f"{type(error).__name__}: {error} The {len(done)} steps before it are kept, "
+                    "and a resumed run goes on with them.",
+                ),
+            )
+        failure.__cause__ = cause if cause is not failure else None
+        if not done:
+            raise failure
+        return torch.stack(done), failure
 
     def _tell_crossings(self, steps: int) -> None:
         """Warn where guards ended episodes."""

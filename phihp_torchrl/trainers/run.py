@@ -28,6 +28,7 @@ from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.interrupt import Interrupt
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
 from phihp_torchrl.trainers.phases import PHASES, Phase, real_steps
+from phihp_torchrl.trainers.rehearsal import rehearse
 from phihp_torchrl.trainers.run_checks import check_run
 from phihp_torchrl.trainers.run_config import RunConfig, task_of
 from phihp_torchrl.trainers.run_directory import MetricsTable, RunDirectory
@@ -117,6 +118,7 @@ def run(
         directory = RunDirectory(path, config.keep_checkpoints)
         check_same(config, directory)
     else:
+        rehearse(config, world)
         config, directory = start_directory(config, path)
     with Interrupt() as interrupt:
         return _Run(config, world, directory, interrupt).run()

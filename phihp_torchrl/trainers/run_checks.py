@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import torch
+
 from phihp_torchrl.config import ConfigError, resolve_seconds
-from phihp_torchrl.tasks import Task
+from phihp_torchrl.imagination import make_start_states
+from phihp_torchrl.tasks import Task, check_functions
 from phihp_torchrl.trainers.phases import PHASES
 from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.run_config import RunConfig
@@ -20,6 +23,7 @@ def check_run(config: RunConfig, world: World) -> None:
             step of the task or do not fit other settings.
     """
     task = world.task
+    check_functions(task)
     for name, section in {**config.sections, "planner": config.planner}.items():
         if section is not None:
             try:
@@ -44,6 +48,11 @@ def check_run(config: RunConfig, world: World) -> None:
             )
     if isinstance(policy := config.sections.get("policy"), PolicyConfig):
         strategies_of(policy)  # refuses unknown ones
+        data = torch.zeros(1, task.state_dim)  # phase 1 will have collected some
+        try:
+            make_start_states(task, policy.start, data)
+        except ConfigError as error:
+            raise ConfigError("policy.start", error.reason) from error
     if getattr(config.sections.get("policy"), "draw_constants", False):
         _check_drawing(config, task)
     if world.truth is None:

@@ -10,6 +10,7 @@ from phihp_torchrl.config import (
     ConfigError,
     Method,
     check_count,
+    check_fields,
     check_not_negative,
     get_method,
     to_mapping,
@@ -23,6 +24,9 @@ from phihp_torchrl.worlds import WORLDS, SimulatedConfig
 
 FREE_KEYS = ("checkpoint_interval", "keep_checkpoints", "progress", "logger")
 """Settings that a resumed run may change, because they do not affect its results."""
+
+
+_MOST_THREADS = 1024
 
 
 @dataclass(frozen=True)
@@ -94,15 +98,24 @@ class RunConfig:
     sections: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_training_seed(self.seed)
         check_count(self, "keep_checkpoints", "threads")
         check_not_negative(self, "checkpoint_interval")
+        if self.threads > _MOST_THREADS:
+            raise ConfigError("threads", f"expected at most {_MOST_THREADS}, got {self.threads}.")
+        if getattr(self.world, "kind", None) not in WORLDS:
+            raise ConfigError("world", f"expected settings of a world, got {self.world!r}.")
         method = get_method(self.method)
         if unknown := unknown_phases(method.phases):
             raise ConfigError(
                 "method", f"expected phases among {sorted(PHASES)}, {self.method!r} has {unknown}."
             )
         sections = {name: self.sections.get(name, PHASES[name].config()) for name in method.phases}
+        for name, section in sections.items():
+            if not isinstance(section, PHASES[name].config):
+                kind = PHASES[name].config.__name__
+                raise ConfigError(name, f"expected a {kind}, got {section!r}.")
         object.__setattr__(self, "sections", sections)
         self._check_planner(method)
         self._check_model_kind(method)

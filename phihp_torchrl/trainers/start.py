@@ -9,6 +9,7 @@ from typing import Any
 
 from phihp_torchrl.config import ConfigError, differences, get_method
 from phihp_torchrl.trainers.checkpoints import load_state
+from phihp_torchrl.trainers.resume_command import resume_command
 from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig, is_enabled
 from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
 from phihp_torchrl.trainers.run_request import read_run_config
@@ -32,7 +33,9 @@ def start_directory(config: RunConfig, path: str | Path | None) -> tuple[RunConf
         path = new_run_directory(config.task, config.label)
     directory = RunDirectory(path, config.keep_checkpoints)
     if directory.config.exists():
-        raise ConfigError("run_dir", f"{path} holds a run already; go on with resume={path}.")
+        raise ConfigError(
+            "run_dir", f"{path} holds a run already; go on with: {resume_command(path)}"
+        )
     if directory.path.exists() and (not directory.path.is_dir() or any(directory.path.iterdir())):
         raise ConfigError("run_dir", f"expected an empty or new directory, {path} is not.")
     directory.path.mkdir(parents=True, exist_ok=True)

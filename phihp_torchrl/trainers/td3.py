@@ -18,7 +18,13 @@ from phihp_torchrl.agents import (
     copy_twin_qvalue,
     learning_rate_scale,
 )
-from phihp_torchrl.config import ConfigError, check_count, check_not_negative, check_share
+from phihp_torchrl.config import (
+    ConfigError,
+    check_count,
+    check_memory,
+    check_not_negative,
+    check_share,
+)
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Batch, Rollouts, Worlds
 from phihp_torchrl.tasks import Task
@@ -77,6 +83,8 @@ class RealTD3Config(TD3Config):
             "evaluation_interval",
             "evaluation_episodes",
         )
+        for name in ("batch_size", "replay_capacity"):
+            check_memory(self, name, each=16)
         check_not_negative(self, "exploration_noise")
         check_count(self, "random_steps", least=0)
         most = min(self.replay_capacity, self.real_steps)

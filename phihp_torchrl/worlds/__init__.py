@@ -32,6 +32,7 @@ from phihp_torchrl.worlds.simulated import (
     register_env,
     register_plant,
 )
+from phihp_torchrl.worlds.task_check import check_env, check_task
 from phihp_torchrl.worlds.torchrl import EnvWorld, TorchRLConfig, import_object
 
 __all__ = [
@@ -46,6 +47,7 @@ __all__ = [
     "TaskEnv",
     "TorchRLConfig",
     "World",
+    "check_task",
     "make_world",
     "register_env",
     "register_plant",

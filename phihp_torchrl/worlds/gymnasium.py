@@ -11,7 +11,7 @@ import gymnasium
 from numpy.typing import NDArray
 from torchrl.envs import EnvBase, GymWrapper
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, check_fields
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds.torchrl import EnvWorld, fit_env, frame
 
@@ -37,6 +37,9 @@ class GymnasiumConfig:
 
     id: str
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @staticmethod
     def task_of(settings: Mapping[str, Any]) -> str | None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NoReturn
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, check_fields
 from phihp_torchrl.recordings import (
     RecordedData,
     Recording,
@@ -53,6 +53,7 @@ class RecordedConfig:
     smooth: bool = True
 
     def __post_init__(self) -> None:
+        check_fields(self)
         if not self.files:
             raise ConfigError("files", "expected a file, a pattern or a list of them, got none.")
         if self.time_step is not None and not 0 < self.time_step < math.inf:

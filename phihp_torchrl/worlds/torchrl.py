@@ -19,7 +19,7 @@ from torchrl.envs import (
     TransformedEnv,
 )
 
-from phihp_torchrl.config import ConfigError, import_named
+from phihp_torchrl.config import ConfigError, check_fields, import_named
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.command_memory import command_memory
@@ -51,6 +51,7 @@ class TorchRLConfig:
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         module, _, function = self.make.partition(":")
         if not (module and function):
             raise ConfigError("make", f"expected module:function, got {self.make!r}.")
@@ -121,14 +122,7 @@ def fit_env(task: Task, env: EnvBase) -> EnvBase:
         ConfigError: if it does not fit; the message names the key, what was expected of it and what
             was found.
     """
-    if env.batch_size:
-        raise ConfigError("world", f"expected batch size [], got {list(env.batch_size)}.")
-    _check_observation(task, env)
-    _check_action(task, env)
-    reward = env.full_reward_spec.get("reward", None)
-    if reward is None or reward.shape.numel() != 1:
-        found = "none" if reward is None else f"shape {list(reward.shape)}"
-        raise ConfigError("world", f"expected a 'reward' of one number, got {found}.")
+    check_keys(task, env)
     transforms = []
     doubles = [
         key
@@ -145,6 +139,23 @@ def fit_env(task: Task, env: EnvBase) -> EnvBase:
     if task.limits.ends_episodes:
         transforms.append(ConstraintEnd(task))
     return TransformedEnv(env, Compose(*transforms)) if transforms else env
+
+
+def check_keys(task: Task, env: EnvBase) -> None:
+    """Refuse an environment whose batch size, observation, action or reward are not the task's.
+
+    Raises:
+        ConfigError: if it does not fit; the message names the key, what was expected of it and what
+            was found.
+    """
+    if env.batch_size:
+        raise ConfigError("world", f"expected batch size [], got {list(env.batch_size)}.")
+    _check_observation(task, env)
+    _check_action(task, env)
+    reward = env.full_reward_spec.get("reward", None)
+    if reward is None or reward.shape.numel() != 1:
+        found = "none" if reward is None else f"shape {list(reward.shape)}"
+        raise ConfigError("world", f"expected a 'reward' of one number, got {found}.")
 
 
 def import_object(key: str, name: str) -> Any:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchdiffeq import odeint
 
-from phihp_torchrl import get_task
-from phihp_torchrl.integrators import Dopri5
+from phihp_torchrl import HybridDynamics, TaskWorldModel, get_task
+from phihp_torchrl.integrators import Dopri5, StateLayout
+from phihp_torchrl.planners import CEMConfig, make_planner
+from phihp_torchrl.systems import Pendulum
 from phihp_torchrl.worlds import find_plant
 
 from .oscillator import FREE, START, error_after_one_second, oscillator, rotate, world
@@ -57,5 +61,42 @@ def test_it_gets_past_a_cart_that_sticks_in_dry_friction(dtype):
 
 @pytest.mark.parametrize("settings", [{"rtol": 0.0}, {"atol": -1.0}, {"rtol": math.nan}])
 def test_tolerances_are_positive(settings):
-    with pytest.raises(ValueError, match=r"^rtol, atol: expected positive"):
+    with pytest.raises(ValueError, match=r"^[ra]tol: expected a positive"):
         Dopri5(**settings)
+
+
+def explode(state):
+    """A law that runs away from 1, and is at rest at 0."""
+    return state**3 * 1e4
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("wrong", [3.0, 1e20, math.inf, math.nan])
+def test_a_state_that_runs_away_becomes_nan_and_leaves_the_others_alone(dtype, wrong):
+    layout = StateLayout(size=1)
+    state = torch.tensor([[0.0], [wrong], [1e-4]], dtype=dtype)
+    found = Dopri5()(explode, state, 0.1, layout)
+    alone = Dopri5()(explode, state[[0, 2]], 0.1, layout)
+    assert found[1].isnan().all()
+    torch.testing.assert_close(found[[0, 2]], alone, rtol=1e-4, atol=1e-8)
+
+
+def test_a_candidate_that_runs_away_loses():
+    torch.manual_seed(0)
+    task = get_task("pendulum")
+
+    class Runaway(Pendulum):
+        def prior(self, state, action, constants):
+            away = torch.where(action > 1.0, 1e3 * state.abs() ** 3 + 1e3, torch.zeros_like(state))
+            return super().prior(state, action, constants) + away
+
+    task = replace(task, system=Runaway(), velocity_limits={})
+    dynamics = HybridDynamics.pure_prior(task, integrator=Dopri5())
+    settings = CEMConfig(
+        planning_horizon=4, num_candidates=64, top_k=8, optim_steps=2, num_policy_candidates=0
+    )
+    planner = make_planner(TaskWorldModel(task, dynamics), None, None, settings)
+    first = task.observe(torch.tensor([0.5, 0.0]))
+    action = planner(TensorDict(observation=first, is_init=torch.ones(1).bool()))["action"]
+    assert action.isfinite().all()
+    assert action <= 1.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase, GymWrapper, RewardSum, StepCounter, TransformedEnv
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, check_fields
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.imagination import WorldModelEnv
 from phihp_torchrl.integrators import check_integrator, integrator_of
@@ -54,7 +54,11 @@ class SimulatedConfig:
     noise: Mapping[str, float] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
+        check_fields(self)
         check_integrator(self)
+        for name, value in self.noise.items():
+            if value < 0:
+                raise ConfigError(f"noise.{name}", f"expected a number >= 0, got {value!r}.")
 
 
 class SimulatedWorld(World):
