@@ -7,6 +7,8 @@ from phihp_torchrl.trainers.collect import CollectConfig, Policy, planning_polic
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.evaluate import EvaluateConfig, EvaluatePhase
 from phihp_torchrl.trainers.exploration import Exploration, ExplorationConfig
+from phihp_torchrl.trainers.files import write_atomically
+from phihp_torchrl.trainers.finite import NonFiniteError
 from phihp_torchrl.trainers.imagined_analytic import ImaginedAnalytic
 from phihp_torchrl.trainers.imagined_td3 import ImaginedTD3
 from phihp_torchrl.trainers.learners import (
@@ -30,9 +32,10 @@ from phihp_torchrl.trainers.results import read_controllers, read_result
 from phihp_torchrl.trainers.run import RunResult, run
 from phihp_torchrl.trainers.run_checks import check_run
 from phihp_torchrl.trainers.run_config import RunConfig, task_of
-from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory, write_atomically
+from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
 from phihp_torchrl.trainers.run_request import RunRequest, read_request, read_run_config
 from phihp_torchrl.trainers.td3 import RealTD3Config, RealTD3Trainer
+from phihp_torchrl.trainers.trust import check_trusted, named_code
 
 __all__ = [
     "CalibrateConfig",
