@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from phihp_torchrl.trainers.calibrate import CalibrateConfig, CalibratePhase
+from phihp_torchrl.trainers.checkpoints import load_latest, load_state
 from phihp_torchrl.trainers.collect import CollectConfig, Policy, planning_policy, random_policy
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.evaluate import EvaluateConfig, EvaluatePhase
@@ -19,6 +20,7 @@ from phihp_torchrl.trainers.learners import (
     register_learner,
 )
 from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
+from phihp_torchrl.trainers.metrics_table import read_rows
 from phihp_torchrl.trainers.model import ModelTrainer
 from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
 from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_phase

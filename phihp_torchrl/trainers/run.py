@@ -274,7 +274,6 @@ class _Run:
         # A checkpoint of an earlier phase was outlived by that phase's final state.
         if found is not None and found[1].get("phase") == name:
             self._restore(phase, found[1], ours=True)
-            GlobalRNGState().load_state_dict(found[1]["random"])
 
     def _restore(self, phase: Phase, state: Mapping[str, Any], *, ours: bool) -> None:
         """Continue from a state, of this run or (``ours`` false) of the one it begins from."""
@@ -283,6 +282,8 @@ class _Run:
         try:
             phase.load_state_dict(state["trainer"])
             self.position = _Position(**state["position"])
+            if not phase.done:
+                GlobalRNGState().load_state_dict(state["random"])
         except Exception as error:  # a hostile state may fail in any way
             raise CheckpointError(
                 f"{self.directory.path}: its checkpoint of phase {state.get('phase')!r} does not "

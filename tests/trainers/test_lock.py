@@ -85,9 +85,10 @@ def test_two_that_start_in_one_directory(tmp_path: Path) -> None:
 def test_a_start_that_was_cut_off_is_begun_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
+    with monkeypatch.context() as patch:
         patch.setattr(RunDirectory, "write_config", lambda *_: 1 / 0)
-        run(tally_config(), tmp_path / "run")
+        with pytest.raises(ZeroDivisionError):
+            run(tally_config(), tmp_path / "run")
     (tmp_path / "run" / ".config.yaml.0123.stage").write_text("task: pend")
     assert run(tally_config(), tmp_path / "run").finished
     assert not list((tmp_path / "run").glob(".*.stage"))
@@ -124,5 +125,5 @@ def test_a_directory_that_nobody_may_write_to_is_named(
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(FileLock, "acquire", refuse)
-    with pytest.raises(ConfigError, match="cannot be written to: .*Permission"), RunLock(tmp_path):
+    with pytest.raises(ConfigError, match=r"cannot be written to: .*Permission"), RunLock(tmp_path):
         pass

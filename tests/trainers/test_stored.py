@@ -30,9 +30,10 @@ pytestmark = pytest.mark.usefixtures("tally")
 def stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A run that crashed in its second phase, after two checkpoints of that phase."""
     place = tmp_path / "stopped"
-    with monkeypatch.context() as patch, pytest.raises(Crash):
+    with monkeypatch.context() as patch:
         patch.setattr(Tally, "fail_at", 2)
-        run(tally_config(TallyConfig(units=1)), place)
+        with pytest.raises(Crash):
+            run(tally_config(TallyConfig(units=1)), place)
     return place
 
 
@@ -134,9 +135,10 @@ def test_a_kill_before_the_metadata_of_a_phase_loses_nothing(
             raise Crash
         written(self, metadata)
 
-    with monkeypatch.context() as patch, pytest.raises(Crash):
+    with monkeypatch.context() as patch:
         patch.setattr(RunDirectory, "write_metadata", crash)
-        run(tally_config(), tmp_path / "run")
+        with pytest.raises(Crash):
+            run(tally_config(), tmp_path / "run")
     assert run(tally_config(), tmp_path / "run", resume=True).finished
     metadata = RunDirectory(tmp_path / "run").read_metadata()
     assert metadata["seconds"].keys() == {"tally-one", "tally-two"}
@@ -207,9 +209,10 @@ def test_a_run_from_another_has_its_own_table(
 ) -> None:
     run(tally_config(), tmp_path / "first")
     later = tally_config(phases=("tally-two",), start_from=str(tmp_path / "first"))
-    with monkeypatch.context() as patch, pytest.raises(Crash):
+    with monkeypatch.context() as patch:
         patch.setattr(Tally, "fail_at", 2)
-        run(later, tmp_path / "later")
+        with pytest.raises(Crash):
+            run(later, tmp_path / "later")
     assert run(later, tmp_path / "later", resume=True).finished
     assert [row["unit"] for row in table(tmp_path / "later" / "metrics.csv")] == ["3", "4", "5"]
 
@@ -246,13 +249,14 @@ def _agent(place: Path) -> list[Path]:
 def test_files_are_replaced_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "file"
     write_atomically(path, "old")
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="full"):
 
-        def full(_: int) -> None:
-            raise OSError("the disk is full")
+    def full(_: int) -> None:
+        raise OSError("the disk is full")
 
+    with monkeypatch.context() as patch:
         patch.setattr("os.fsync", full)
-        write_atomically(path, "new")
+        with pytest.raises(OSError, match="full"):
+            write_atomically(path, "new")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
     assert unsealed(sealed({"a": (1, 2.5), "sha256": "x"})) == {"a": [1, 2.5]}
