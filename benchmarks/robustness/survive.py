@@ -61,8 +61,9 @@ OPERATIONS = ("replace", "rename", "fsync", "mkdir", "unlink", "rmdir")
 TINY = {
     "checkpoint_interval": 0, "compile": False, "progress": False,
     "model.real_steps": 60, "model.steps_per_iteration": 30, "model.fit.steps": 2,
-    "model.collect.planning_horizon": 3, "model.collect.num_candidates": 8,
-    "model.collect.top_k": 2, "model.collect.optim_steps": 1, "policy.updates": 12,
+    "model.collect.planning_horizon": 3, "model.collect.replan_every": 2,
+    "model.collect.num_candidates": 8, "model.collect.top_k": 2, "model.collect.optim_steps": 1,
+    "policy.updates": 12,
     "policy.batch_size": 8, "policy.num_worlds": 4, "policy.replay_capacity": 200,
     "policy.random_steps": 16, "policy.evaluation_interval": 4, "policy.evaluation_episodes": 2,
     "policy.refit.interval": 0, "policy.td3.actor_hidden_sizes": [8],
@@ -170,14 +171,14 @@ def work(
             setattr(os, name, counting(getattr(os, name)))
     if units is not None:
         module = sys.modules["phihp_torchrl.trainers.run"]
-        log_unit = module._Run._log_unit  # type: ignore[attr-defined]
+        log_unit = module._Run._log_unit
 
         def stopping(self: Any, *arguments: Any) -> None:
             log_unit(self, *arguments)
             if self.position.unit == units:
                 os.kill(os.getpid(), signal.SIGTERM)
 
-        module._Run._log_unit = stopping  # type: ignore[attr-defined]
+        module._Run._log_unit = stopping
     result = run(config, path, resume=RunDirectory(path).config.is_file())
     if counted is not None:
         counted.write_text(str(made))
@@ -337,8 +338,7 @@ def reader(kind: str, config: RunConfig, path: Path) -> Callable[[], Any]:
     known = directory.read_metadata()
     started = known["config"]
     rows = read_rows(directory.metrics)
-    newest = sorted((path / "checkpoints").glob("unit-*"))[-1:]
-    newest = newest[0] if newest else path
+    newest = max((path / "checkpoints").glob("unit-*"), default=path)
     readers: dict[str, Callable[[], Any]] = {
         "config.yaml": settings,
         "metadata.json": metadata,
