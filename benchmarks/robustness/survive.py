@@ -27,7 +27,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,7 @@ from phihp_torchrl.trainers import (
 RESULTS = Path("results/robustness")
 HOSTILE = ("tests/trainers/test_hostile.py", "tests/deployment/test_saving.py")
 TASK = "brief-pendulum"
+AT_RANDOM, BEFORE_OPERATION = "at a random time", "before an operation on files"
 PHASES = ("model", "policy", "evaluate")
 OPERATIONS = ("replace", "rename", "fsync", "mkdir", "unlink", "rmdir")
 """Functions of ``os`` by which files come, move and go."""
@@ -85,45 +86,41 @@ def main() -> None:
     logging.disable(logging.CRITICAL)
     register_task(replace(get_task("pendulum"), name=TASK, max_steps=20), replace=True)
     config = read_run_config(load_config(TASK, overrides=TINY))
-    found: dict[str, Any] = {"origin": describe_origin(seed=0)}
+    found: dict[str, Any] = {"origin": describe_origin(seed=0), "kills": {}}
     with tempfile.TemporaryDirectory() as place:
-        found |= measure(config, Path(place), options.kills, options.flips)
+        for part in parts(config, Path(place), options.kills, options.flips):
+            found |= part
+            write(found, options.out_dir)  # what was tried so far, should it be stopped
     found["hostile"] = hostile_folders()
-    options.out_dir.mkdir(parents=True, exist_ok=True)
-    (options.out_dir / "robustness.json").write_text(json.dumps(found, indent=2) + "\n")
-    (options.out_dir / "README.md").write_text(page(found))
-    print(page(found))
+    write(found, options.out_dir)
 
 
-def measure(config: RunConfig, place: Path, kills: int, flips: int) -> dict[str, Any]:
-    """Kills and flips of one small run."""
+def write(found: dict[str, Any], place: Path) -> None:
+    """Write the page of results, and the numbers on it."""
+    place.mkdir(parents=True, exist_ok=True)
+    (place / "robustness.json").write_text(json.dumps(found, indent=2) + "\n")
+    (place / "README.md").write_text(page(found))
+
+
+def parts(config: RunConfig, place: Path, kills: int, flips: int) -> Iterator[dict[str, Any]]:
+    """Flips and kills of one small run, the results as they come."""
     start = time.monotonic()
-    with child(config, place / "whole") as pid:
+    count = place / "operations.txt"
+    with child(config, place / "whole", counted=count) as pid:
         assert wait(pid) == 0, "the run that nothing disturbs has failed"
-    seconds = time.monotonic() - start
-    expected = outcome(place / "whole")
-    draw = random.Random(0)
-    killed: dict[str, Counter[str]] = {}
-    operations = count_operations(config, place / "counted")
-    for kind in ("at a random time", "before an operation on files"):
-        counts: Counter[str] = Counter()
-        for number in range(kills):
-            path = place / f"killed-{number}"
-            if kind == "at a random time":
-                end = survives(config, path, expected, after=draw.uniform(0, seconds))
-            else:
-                step = 1 + number * operations // kills
-                end = survives(config, path, expected, operation=step)
-            counts[end] += 1
-            shutil.rmtree(path, ignore_errors=True)
-        killed[kind] = counts
+    seconds, operations = time.monotonic() - start, int(count.read_text())
+    yield {"seconds_of_a_run": round(seconds, 1), "operations_on_files": operations}
     stop(config, place / "stopped")
-    return {
-        "seconds_of_a_run": round(seconds, 1),
-        "operations_on_files": operations,
-        "kills": {kind: dict(counts) for kind, counts in killed.items()},
-        "flips": flip_bits(config, place, flips),
-    }
+    yield {"flips": flip_bits(config, place, flips)}
+    draw, expected = random.Random(0), outcome(place / "whole")
+    killed: dict[str, Counter[str]] = {kind: Counter() for kind in (AT_RANDOM, BEFORE_OPERATION)}
+    for number in range(kills):
+        step = 1 + number * operations // kills
+        harms = {AT_RANDOM: {"after": draw.uniform(0, seconds)}, BEFORE_OPERATION: {"step": step}}
+        for kind, harm in harms.items():
+            killed[kind][survives(config, place / "killed", expected, **harm)] += 1
+            shutil.rmtree(place / "killed", ignore_errors=True)
+            yield {"kills": {name: dict(counts) for name, counts in killed.items()}}
 
 
 class child:
@@ -190,24 +187,16 @@ def wait(pid: int) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
-def count_operations(config: RunConfig, path: Path) -> int:
-    """How many operations on files a whole run makes."""
-    count = path.with_suffix(".txt")
-    with child(config, path, counted=count) as pid:
-        assert wait(pid) == 0
-    return int(count.read_text())
-
-
 def survives(
     config: RunConfig,
     path: Path,
     expected: dict[str, Any],
     *,
     after: float | None = None,
-    operation: int | None = None,
+    step: int | None = None,
 ) -> str:
-    """Kill a run, resume it, and say how it ended."""
-    with child(config, path, operation=operation) as pid:
+    """Kill a run after seconds, or before an operation; resume it, and say how it ended."""
+    with child(config, path, operation=step) as pid:
         if after is not None:
             time.sleep(after)
             os.kill(pid, signal.SIGKILL)
@@ -375,35 +364,40 @@ def hostile_folders() -> dict[str, int]:
 
 
 def page(found: dict[str, Any]) -> str:
-    """The page of results."""
-    ends = sorted({end for counts in found["kills"].values() for end in counts})
-    kills = [
-        [kind, *(str(counts.get(end, 0)) for end in ends)]
-        for kind, counts in found["kills"].items()
-    ]
-    columns = ["refused by name", "noticed and restored", "changes nothing", "silently wrong"]
-    flips = [
-        [f"`{kind}`", *(str(counts.get(column, 0)) for column in columns)]
-        for kind, counts in found["flips"].items()
-    ]
-    total = ["all", *(str(sum(int(row[i + 1]) for row in flips)) for i in range(len(columns)))]
-    hostile = found["hostile"]
-    return (
+    """The page of results, with the parts that there are."""
+    text = (
         "# What runs and agents survive\n\n"
         f"Made by `python benchmarks/robustness/survive.py` ({origin_text(found['origin'])}). The "
-        f"run has all phases and takes {found['seconds_of_a_run']} s.\n\n"
-        "## Killed\n\n"
-        "SIGKILL at a random time of the run, and before one of its "
-        f"{found['operations_on_files']} operations on files, evenly spread. A run that is resumed "
-        "must end with the states, rows, agent and evaluation of one that nothing disturbed.\n\n"
-        f"{markdown_table(['killed', *ends], kills)}\n"
-        "## A flipped bit\n\n"
-        "One bit of one file at a time, then all that is read back of it.\n\n"
-        f"{markdown_table(['file', *columns], [*flips, total])}\n"
-        "## Folders of strangers\n\n"
-        f"{hostile['kinds']} kinds of hostile runs and agents were read; {hostile['executed']} "
-        "executed, read or wrote what they named.\n"
+        f"run has all phases and took {found['seconds_of_a_run']} s, beside other work.\n"
     )
+    if flips := found.get("flips"):
+        columns = ["refused by name", "noticed and restored", "changes nothing", "silently wrong"]
+        rows = [
+            [f"`{k}`", *(str(c.get(column, 0)) for column in columns)] for k, c in flips.items()
+        ]
+        total = ["all", *(str(sum(int(row[i + 1]) for row in rows)) for i in range(len(columns)))]
+        text += (
+            "\n## A flipped bit\n\n"
+            "One bit of one file at a time, then all that is read back of it.\n\n"
+            f"{markdown_table(['file', *columns], [*rows, total])}"
+        ).rstrip() + "\n"
+    if kills := found.get("kills"):
+        ends = sorted({end for counts in kills.values() for end in counts})
+        rows = [[kind, *(str(c.get(end, 0)) for end in ends)] for kind, c in kills.items()]
+        text += (
+            "\n## Killed\n\n"
+            "SIGKILL at a random time of the run, and before one of its "
+            f"{found['operations_on_files']} operations on files. A run that is resumed must end "
+            "with the states, rows, agent and evaluation of one that nothing disturbed.\n\n"
+            f"{markdown_table(['killed', *ends], rows)}"
+        ).rstrip() + "\n"
+    if hostile := found.get("hostile"):
+        text += (
+            "\n## Folders of strangers\n\n"
+            f"{hostile['kinds']} kinds of hostile runs and agents were read; {hostile['executed']} "
+            "executed, read or wrote what they named.\n"
+        )
+    return text
 
 
 if __name__ == "__main__":
