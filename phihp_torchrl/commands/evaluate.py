@@ -36,6 +36,7 @@ class PlayConfig:
         video: whether to write a GIF of an episode (needs the extra rendering).
         out_dir: directory of pictures and evaluation.json; null for that of the agent.
         plugins: Python files or modules to import, which register tasks and worlds.
+        trust: whether to play in a world that is made by code which the agent's file names.
         threads: intra-op threads.
         compile: whether to compile the planner (10 to 40 s the first time).
     """
@@ -50,6 +51,7 @@ class PlayConfig:
     video: bool = True
     out_dir: str | None = None
     plugins: tuple[str, ...] = field(default=())
+    trust: bool = False
     threads: int = 1
     compile: bool = False
 
@@ -83,7 +85,7 @@ def play(config: PlayConfig) -> None:
         play_baselines,
         show_episode,
     )
-    from phihp_torchrl.trainers import import_plugins
+    from phihp_torchrl.trainers import import_plugins, write_atomically
 
     import_plugins(config.plugins)
     check_names(config.baselines)
@@ -114,7 +116,7 @@ def play(config: PlayConfig) -> None:
         results[BASELINES_KEY] = beside
     directory = Path(config.out_dir or config.agent)
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / "evaluation.json").write_text(json.dumps(results, indent=2) + "\n")
+    write_atomically(directory / "evaluation.json", json.dumps(results, indent=2) + "\n")
     options = {"world": world, "video": config.video, "seed": config.seed}
     for path in show_episode(shown, directory, **options):  # type: ignore[arg-type]
         print(f"wrote {path}")  # noqa: T201
@@ -140,9 +142,19 @@ def _load(config: PlayConfig) -> dict[str, Agent]:
 
 def _world(config: PlayConfig, agent: Agent) -> World:
     """The world that is asked for, or else the one in which the agent was trained."""
+    from phihp_torchrl.trainers import named_code
     from phihp_torchrl.worlds import make_world
 
     trained_in = (agent.metadata.get("config") or {}).get("world")
+    named = {} if config.world else named_code({"world": trained_in})
+    if named and not config.trust:
+        listed = ", ".join(f"{key}: {name}" for key, name in named.items())
+        raise ConfigError(
+            "world",
+            f"the agent's file names code that would be imported and called ({listed}), and anyone "
+            "may have written it. Read that code; if you trust it, name the world on the command "
+            "line or say trust=true.",
+        )
     world = config.world or trained_in or "simulated"
     return make_world(agent.task, world)
 

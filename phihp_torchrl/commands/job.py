@@ -19,6 +19,7 @@ from phihp_torchrl.config import (
 )
 from phihp_torchrl.evaluation import controllers_table, returns_table
 from phihp_torchrl.trainers import (
+    NonFiniteError,
     RunResult,
     read_controllers,
     read_request,
@@ -53,7 +54,7 @@ def job(composed: DictConfig) -> None:
     try:
         request = read_request(composed, HydraConfig.get().overrides.task)
         result = run(request.config, request.path, resume=request.resume)
-    except (ConfigError, CheckpointError) as error:
+    except (ConfigError, CheckpointError, NonFiniteError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -80,6 +80,8 @@ def _defaults() -> str:
         ("resume", "directory of a run to go on with; it takes the configuration of that run"),
     ):
         lines += [f"# {sentence}", f"{place}: null"]
+    lines += ["# whether to run code that the run to go on with names, whoever wrote it"]
+    lines += ["trust: false"]
     for name, kind in PHASES.items():
         if kind.config.__module__.startswith("phihp_torchrl."):
             users = ", ".join(n for n, method in METHODS.items() if name in method.phases)

@@ -48,6 +48,14 @@ from phihp_torchrl.config.help import help_text, sentences, sentences_of, settin
 from phihp_torchrl.config.methods import METHODS, Method, get_method, register_method
 from phihp_torchrl.config.modules import import_named
 from phihp_torchrl.config.registry import Registry
+from phihp_torchrl.config.seals import (
+    DIGEST,
+    check_seal,
+    digest_of,
+    digest_of_values,
+    sealed,
+    unsealed,
+)
 from phihp_torchrl.config.typed import (
     default_of,
     differences,

@@ -27,8 +27,8 @@ from phihp_torchrl.config.typed import flatten
 MODULE = "phihp_torchrl.config.settings"
 """Package of the YAML files, as Hydra addresses it."""
 
-PLACES = ("run_dir", "resume")
-"""Settings that say where a run is stored; they are not part of its configuration."""
+PLACES = ("run_dir", "resume", "trust")
+"""Settings that say where a run is stored, and whether to trust it; no part of its settings."""
 
 # The values of these are names of files, whose content is in the composed settings already.
 _GROUPS = ("preset", "task", "method", "budget", "logger", "world", "planner")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, fields, replace
 from importlib import import_module
 from pathlib import Path
@@ -16,7 +17,15 @@ import torch
 from safetensors.torch import save as dump_tensors
 from torch import Tensor, nn
 
-from phihp_torchrl.config import ConfigError, Registry, from_mapping
+from phihp_torchrl.config import (
+    DIGEST,
+    ConfigError,
+    Registry,
+    check_seal,
+    digest_of,
+    from_mapping,
+    sealed,
+)
 from phihp_torchrl.deployment.agent import Agent
 from phihp_torchrl.deployment.formats import (
     BOUNDS_OF_VERSION_1,
@@ -31,6 +40,10 @@ from phihp_torchrl.tasks import Actuator, Constraint, Task, get_task
 
 AGENT_FILE = "agent.json"
 WEIGHTS_FILE = "weights.safetensors"
+NEXT_WEIGHTS_FILE = ".next-weights.safetensors"
+"""Weights of a saving that was cut off after ``agent.json`` was replaced, or before."""
+
+_SAVING = ".saving-"
 
 AGENT_KINDS: Registry[type[Agent]] = Registry("kind")
 """Registered classes of agents, by the ``kind`` in their files."""
@@ -59,7 +72,9 @@ def save_agent(
 ) -> Path:
     """Save an agent as ``agent.json`` and ``weights.safetensors``, keeping other files.
 
-    Each file is replaced atomically, and loading refuses files of two different saves.
+    However the saving ends, the directory holds a whole agent, the old one or the new: the new
+    weights are written beside the old ones, ``agent.json`` with their digest is then replaced in
+    one step, and loading takes the weights that belong to it.
 
     Args:
         agent: the agent, on any device.
@@ -107,25 +122,29 @@ def save_agent(
         **_additions(agent.task),
         **({"outside": outside} if (outside := _outside(agent.task)) else {}),
         **config,
-        "weights_sha256": hashlib.sha256(data).hexdigest(),
+        "weights_sha256": digest_of(data),
         "metadata": dict(agent.metadata if metadata is None else metadata),
     }
     try:
-        text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+        json.dumps(content, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise AgentError(f"metadata: expected JSON with finite numbers: {error}.") from error
+    text = sealed(content)
     if len(text.encode()) > MAX_JSON_BYTES:
         raise AgentError(f"metadata: expected at most {MAX_JSON_BYTES} bytes of JSON.")
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=directory, prefix=".saving-") as temporary:
+    for left in directory.glob(f"{_SAVING}*"):  # by savings that were killed
+        shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=directory, prefix=_SAVING) as temporary:
         for name, payload in ((WEIGHTS_FILE, data), (AGENT_FILE, text.encode())):
             with open(Path(temporary, name), "wb") as file:
                 file.write(payload)
                 file.flush()
                 os.fsync(file.fileno())
-        for name in (WEIGHTS_FILE, AGENT_FILE):
-            os.replace(Path(temporary, name), directory / name)
+        os.replace(Path(temporary, WEIGHTS_FILE), directory / NEXT_WEIGHTS_FILE)
+        os.replace(Path(temporary, AGENT_FILE), directory / AGENT_FILE)
+        os.replace(directory / NEXT_WEIGHTS_FILE, directory / WEIGHTS_FILE)
     return directory
 
 
@@ -169,6 +188,8 @@ def load_agent(
         raise AgentError(f"{directory}: expected the directory of a saved agent, found none.")
     path = directory / AGENT_FILE
     content = read_json(path)
+    sealed_content = dict(content)
+    content.pop(DIGEST, None)
     _check_format(path, content)
     try:
         content = upgrade(content)
@@ -186,6 +207,10 @@ def load_agent(
             f"disturbance {saved}, got {ours}."
         )
     weights = _read_weights(directory / WEIGHTS_FILE, kind, task, content)
+    try:
+        check_seal(sealed_content)  # last, for other errors say more
+    except ValueError as error:
+        raise AgentError(f"{path}: {error}.") from error
     device = _check_device(device)
     try:
         parts = kind.build_modules(task, content)
@@ -337,11 +362,18 @@ def _read_weights(
         raise AgentError(f"{agent_path}: expected the key {error}, found none.") from error
     except (ValueError, TypeError, RuntimeError, AttributeError) as error:
         raise AgentError(f"{agent_path}: {error}") from error
-    weights, data = read_weights(path, _tensors(parts), ignore=f".{BOUNDS_OF_VERSION_1}")
-    if hashlib.sha256(data).hexdigest() != content.get("weights_sha256"):
+    options: Any = {"expected": _tensors(parts), "ignore": f".{BOUNDS_OF_VERSION_1}"}
+    digest, coming = content.get("weights_sha256"), path.with_name(NEXT_WEIGHTS_FILE)
+    if coming.is_file():
+        with suppress(AgentError):  # else they are of a saving that was cut off earlier
+            weights, data = read_weights(coming, **options)
+            if digest_of(data) == digest:
+                return weights
+    weights, data = read_weights(path, **options)
+    if digest_of(data) != digest:
         raise AgentError(
             f"{path}: expected the weights that {AGENT_FILE} was written with, got others; "
-            "were the files copied from two agents, or was a saving interrupted?"
+            "were the files copied from two agents?"
         )
     return weights
 

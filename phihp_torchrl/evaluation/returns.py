@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Mapping
@@ -19,6 +20,8 @@ from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
 from phihp_torchrl.evaluation.violations import Violations
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld, World
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -187,7 +190,8 @@ def _play_model(
             tally.judge(task.split(next_state)[0], task.command(task.split(state)[1], action))
         # The state of an episode that has ended is not changed any more.
         state = torch.where((tally.alive & ~terminated).unsqueeze(-1), next_state, state)
-        if tally.add(action, reward, terminated, terminated):
+        finite = next_state.isfinite().all(-1)
+        if tally.add(action, reward, terminated, terminated, finite):
             break
     return tally.result()
 
@@ -231,6 +235,7 @@ class _Tally:
         self.returns = torch.zeros(count, dtype=torch.float64, device=device)
         self.lengths = torch.zeros(count, dtype=torch.int64, device=device)
         self.terminated = torch.zeros(count, dtype=torch.bool, device=device)
+        self.lost = torch.zeros(count, dtype=torch.bool, device=device)
         self.alive = torch.ones(count, dtype=torch.bool, device=device)
         self.violated = torch.zeros(count, len(task.constraints), dtype=torch.int64, device=device)
         self.largest = torch.zeros(count, len(task.constraints), device=device)
@@ -242,9 +247,22 @@ class _Tally:
         self.violated += found > 0
         self.largest = torch.maximum(self.largest, found)
 
-    def add(self, action: Tensor, reward: Tensor, terminated: Tensor, done: Tensor) -> bool:
-        """Add a step; returns whether all episodes have ended."""
-        command = self.task.clip_action(action.reshape(-1, self.task.action_dim))
+    def add(
+        self,
+        action: Tensor,
+        reward: Tensor,
+        terminated: Tensor,
+        done: Tensor,
+        finite: Tensor | None = None,
+    ) -> bool:
+        """Add a step; returns whether all episodes have ended.
+
+        An episode with an action, or a state (``finite`` false), that is not finite earns NaN.
+        """
+        action = action.reshape(-1, self.task.action_dim)
+        good = action.isfinite().all(-1)
+        self.lost |= self.alive & ~(good if finite is None else good & finite.reshape(-1))
+        command = self.task.clip_action(action)
         self.actions.append(command / self.scale.to(command.dtype))
         self.returns += torch.where(self.alive, reward.reshape(-1).to(torch.float64), 0.0)
         self.lengths += self.alive
@@ -257,7 +275,15 @@ class _Tally:
 
         Violations are the steps of each constraint, and the largest.
         """
-        own = self.returns, self.lengths, self.terminated, self._chatter()
+        if count := int(self.lost.sum()):
+            _log.warning(
+                "In %d of %d episodes the policy's action or the state left the finite numbers; "
+                "their returns are NaN.",
+                count,
+                len(self.lost),
+            )
+        returns = torch.where(self.lost, math.nan, self.returns)
+        own = returns, self.lengths, self.terminated, self._chatter()
         return *own, self.violated, self.largest
 
     def _chatter(self) -> Tensor:

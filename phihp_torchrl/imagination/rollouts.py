@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -164,7 +165,7 @@ def sum_rewards(
     """Continue episodes for ``steps`` steps of the noise-free policy, and add their rewards.
 
     References and inputs after each step are ``signals`` ``[steps, N, size]``, or else as the model
-    expects them.
+    expects them. An episode whose state leaves the finite numbers before it has ended earns NaN.
     """
     state, total, weight = returns
     for k in range(steps):
@@ -173,6 +174,9 @@ def sum_rewards(
         if signals is not None:
             state = world_model.task.with_signals(state, signals[k])
         total = total + weight * reward
+        # A limit that no comparison with NaN exceeds would else be kept for ever.
+        lost = ~state.isfinite().all(-1) & (weight != 0)
+        total = torch.where(lost, math.nan, total)
         weight = gamma * weight * (1.0 - terminated.to(weight.dtype))
     return Returns(state, total, weight)
 

@@ -80,7 +80,8 @@ def score_sequences(
         + \alpha \gamma^H \min(Q_1, Q_2)(s_H, \pi(s_H)),
 
     where terms after a termination are 0, and changes are in units of the action's half-range. A
-    score that is not finite becomes -inf.
+    score that is not finite becomes -inf, and so does that of a sequence whose state leaves the
+    finite numbers, whatever its rewards are.
 
     Args:
         state: first state of each sequence, ``[rows, n]``.
@@ -121,9 +122,12 @@ def score_sequences(
                 # Before the first action of an episode there is none, which NaN says.
                 reward = reward - change_cost * change.square().sum(-1).nan_to_num(0.0)
             previous = action
+        # States of a stock environment are tensordicts, whose rewards and values alone are judged.
+        finite = state.isfinite().all(-1) if isinstance(state, Tensor) else reward.isfinite()
         if k == 0:
-            total, over = reward, terminated
+            total, over, lost = reward, terminated, ~finite
         else:
+            lost = lost | ~(finite | over)
             total = torch.where(over, total, torch.add(total, reward, alpha=discount))
             over = over | terminated
         discount *= gamma
@@ -136,4 +140,5 @@ def score_sequences(
     if taken:
         actions = torch.stack(taken)
         total = torch.where(actions.isfinite().all(-1).all(0), total, float("-inf"))
+    total = torch.where(lost, float("-inf"), total)
     return torch.nan_to_num(total, *(float("-inf"),) * 3), actions

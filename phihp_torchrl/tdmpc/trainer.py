@@ -207,6 +207,10 @@ class TDMPCTrainer:
         """Return the whole agent, with its planner."""
         return {"agent": self.agent()}
 
+    def trained(self) -> dict[str, Tensor]:
+        """The parameters of model, critics and policy, by name."""
+        return dict(self.told.named_parameters())
+
     def state_dict(self) -> dict[str, Any]:
         """Return the state that a resumed run needs, as tensors and numbers."""
         return {

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from phihp_torchrl.trainers.calibrate import CalibrateConfig, CalibratePhase
+from phihp_torchrl.trainers.checkpoints import load_latest, load_state
 from phihp_torchrl.trainers.collect import CollectConfig, Policy, planning_policy, random_policy
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.evaluate import EvaluateConfig, EvaluatePhase
 from phihp_torchrl.trainers.exploration import Exploration, ExplorationConfig
+from phihp_torchrl.trainers.files import write_atomically
+from phihp_torchrl.trainers.finite import NonFiniteError
 from phihp_torchrl.trainers.imagined_analytic import ImaginedAnalytic
 from phihp_torchrl.trainers.imagined_td3 import ImaginedTD3
 from phihp_torchrl.trainers.learners import (
@@ -17,6 +20,7 @@ from phihp_torchrl.trainers.learners import (
     register_learner,
 )
 from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
+from phihp_torchrl.trainers.metrics_table import read_rows
 from phihp_torchrl.trainers.model import ModelTrainer
 from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
 from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_phase
@@ -31,9 +35,10 @@ from phihp_torchrl.trainers.resume_command import resume_command
 from phihp_torchrl.trainers.run import RunResult, run
 from phihp_torchrl.trainers.run_checks import check_run
 from phihp_torchrl.trainers.run_config import RunConfig, task_of
-from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory, write_atomically
+from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
 from phihp_torchrl.trainers.run_request import RunRequest, read_request, read_run_config
 from phihp_torchrl.trainers.td3 import RealTD3Config, RealTD3Trainer
+from phihp_torchrl.trainers.trust import check_trusted, named_code
 
 __all__ = [
     "CalibrateConfig",

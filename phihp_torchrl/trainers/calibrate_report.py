@@ -14,7 +14,7 @@ from phihp_torchrl.planners import SearchConfig
 from phihp_torchrl.trainers.calibrate_choice import Trial
 from phihp_torchrl.trainers.calibrate_end import End
 from phihp_torchrl.trainers.calibrate_rule import Choice, Finalist
-from phihp_torchrl.trainers.run_directory import write_atomically
+from phihp_torchrl.trainers.files import write_atomically
 
 _log = logging.getLogger(__name__)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import shutil
@@ -17,32 +16,36 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointAdapter, CheckpointError, CheckpointRotation
 
+from phihp_torchrl.config import DIGEST, digest_of
+
 _log = logging.getLogger(__name__)
 
-FORMAT = 1
-"""Version of the content of a checkpoint; other versions are refused."""
+FORMAT = 2
+"""Version of the content of a checkpoint; later versions are refused.
+
+Version 1 has a digest of its tensors alone.
+"""
 
 
 class SafeStateAdapter(CheckpointAdapter):
     """A nested state of tensors, numbers and texts as one safetensors file and one JSON file.
 
     TorchRL's own adapter reads a directory with TensorDict, which unpickles files of a hostile
-    directory. The digest detects damaged files.
+    directory. The JSON file has the digest of the tensors, and the description of the checkpoint
+    that of the JSON file, so that a damaged file is detected, whichever it is.
     """
 
     adapter_id = "phihp_torchrl.safe_state"
-    format_version = FORMAT
+
+    def __init__(self, version: int = FORMAT) -> None:
+        self.format_version = version
 
     def save(
         self, component: Any, path: Path, *, args: tuple[Any, ...], kwargs: Mapping[str, Any]
     ) -> Any:
         path.mkdir(parents=True, exist_ok=True)
-        tensors: dict[str, Tensor] = {}
-        tree = _encode(component.state_dict(), tensors)
-        data = save_tensors(tensors)
-        (path / "tensors.safetensors").write_bytes(data)
-        digest = hashlib.sha256(data).hexdigest()
-        (path / "tree.json").write_text(json.dumps({"tensors": digest, "tree": tree}))
+        (path / "tensors.safetensors").write_bytes(component.data)
+        (path / "tree.json").write_text(component.tree)
 
     def load(
         self,
@@ -54,9 +57,12 @@ class SafeStateAdapter(CheckpointAdapter):
         args: tuple[Any, ...],
         kwargs: Mapping[str, Any],
     ) -> Any:
-        record = json.loads((path / "tree.json").read_text())
+        text = (path / "tree.json").read_bytes()
+        if component.digest not in (None, digest_of(text)):
+            raise CheckpointError(f"{path / 'tree.json'}: damaged, its digest is another.")
+        record = json.loads(text)
         data = (path / "tensors.safetensors").read_bytes()
-        if hashlib.sha256(data).hexdigest() != record["tensors"]:
+        if digest_of(data) != record["tensors"]:
             raise CheckpointError(
                 f"{path / 'tensors.safetensors'}: damaged, its digest is another."
             )
@@ -64,10 +70,20 @@ class SafeStateAdapter(CheckpointAdapter):
 
 
 class State:
-    """Holds a state while a checkpoint is written or read."""
+    """Holds a state while a checkpoint is written or read.
 
-    def __init__(self, state: Mapping[str, Any] | None = None) -> None:
+    Args:
+        state: the state to write.
+        digest: the digest that the JSON file to read must have; ``None`` for any.
+    """
+
+    def __init__(self, state: Mapping[str, Any] | None = None, digest: str | None = None) -> None:
         self.state = state or {}
+        tensors: dict[str, Tensor] = {}
+        tree = _encode(self.state, tensors)
+        self.data = save_tensors(tensors)
+        self.tree = json.dumps({"tensors": digest_of(self.data), "tree": tree})
+        self.digest = digest
 
     def state_dict(self) -> Mapping[str, Any]:
         return self.state
@@ -91,8 +107,9 @@ def save_state(
         metadata: description of the state; :func:`load_state` requires an equal one.
         step: position in the rotation.
     """
-    checkpoint = _checkpoint(State(state))
-    metadata = {**metadata, "format": FORMAT}
+    holder = State(state)
+    checkpoint = _checkpoint(holder)
+    metadata = {**metadata, "format": FORMAT, DIGEST: digest_of(holder.tree)}
     if isinstance(directory, CheckpointRotation):
         return directory.save(checkpoint, step=step, metadata=metadata)
     return checkpoint.save(directory, metadata=metadata)
@@ -105,14 +122,16 @@ def load_state(path: Path, *, metadata: Mapping[str, Any]) -> dict[str, Any]:
         CheckpointError: if it is absent, damaged, of another version or of something else than
             ``metadata`` says; the message names the path.
     """
-    holder = State()
     try:
         found = Checkpoint.manifest(path).get("metadata")
         found = found if isinstance(found, Mapping) else {}
-        for key, expected in {**metadata, "format": FORMAT}.items():
+        version = 1 if found.get("format") == 1 else FORMAT
+        for key, expected in {**metadata, "format": version}.items():
             if found.get(key) != expected:
                 raise CheckpointError(f"expected {key} {expected!r}, found {found.get(key)!r}.")
-        _checkpoint(holder).load(path)
+        digest = None if version == 1 else str(found.get(DIGEST))
+        holder = State(digest=digest)
+        _checkpoint(holder, version).load(path)
     # A hostile or truncated file may raise anything; the user should read one sentence.
     except Exception as error:
         raise CheckpointError(f"{path}: not a usable checkpoint: {error}") from error
@@ -159,8 +178,8 @@ def clear_rotation(rotation: CheckpointRotation) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-def _checkpoint(state: State) -> Checkpoint:
-    return Checkpoint().register("state", state, adapter=SafeStateAdapter())
+def _checkpoint(state: State, version: int = FORMAT) -> Checkpoint:
+    return Checkpoint().register("state", state, adapter=SafeStateAdapter(version))
 
 
 def _encode(value: Any, tensors: dict[str, Tensor]) -> Any:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from phihp_torchrl.baselines import check_names
-from phihp_torchrl.config import check_count, check_fields
-from phihp_torchrl.deployment import Agent, save_agent
+from phihp_torchrl.config import check_count, check_fields, digest_of
+from phihp_torchrl.deployment import Agent, AgentError, load_agent, save_agent
 from phihp_torchrl.evaluation import (
     BASELINES_KEY,
     EVALUATION_SEED,
@@ -23,9 +24,10 @@ from phihp_torchrl.evaluation import (
 )
 from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.files import write_atomically
 from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
 from phihp_torchrl.trainers.run_config import RunConfig
-from phihp_torchrl.trainers.run_directory import RunDirectory, write_atomically
+from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.worlds import GuardedWorld, World, crossings_text
 
 _log = logging.getLogger(__name__)
@@ -107,6 +109,7 @@ class EvaluatePhase:
         self.directory = directory
         self.samples = samples
         self.results: dict[str, dict[str, Any]] = {}
+        self.beside: dict[str, dict[str, Any]] = {}
         self.new_files: list[NewFile] = []
         self._steps: list[tuple[str, Agent]] = []
         if agent.planner is not None and world.has_env:
@@ -130,8 +133,8 @@ class EvaluatePhase:
         self.new_files = []
         if len(self.results) < len(self._steps):
             return self._evaluate(*self._steps[len(self.results)])
-        beside = self._beside()
-        self._save(beside)
+        self.beside = self._beside()
+        self._save()
         if self.world.has_env:
             self._show()
         else:
@@ -142,17 +145,35 @@ class EvaluatePhase:
         self._finished = True
         return {
             f"evaluate/{name}/{key}": value
-            for name, result in beside.items()
+            for name, result in self.beside.items()
             for key, value in result.items()
             if key != "returns"
         }
 
+    @property
+    def digests(self) -> dict[str, str]:
+        """The digests of files that are read again, for the record of the run."""
+        return {self.directory.evaluation.name: digest_of(self._text())}
+
     def state_dict(self) -> dict[str, Any]:
-        return {"results": self.results, "finished": self._finished}
+        return {"results": self.results, "beside": self.beside, "finished": self._finished}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.results = dict(state["results"])
+        self.beside = dict(state.get("beside", {}))
         self._finished = bool(state["finished"])
+
+    def restore_files(self) -> None:
+        """Write the files of a finished phase again that are gone or damaged since."""
+        place = self.directory.evaluation
+        if not place.is_file() or place.read_bytes() != self._text().encode():
+            _log.warning("%s is gone or damaged, and is written again.", place)
+            write_atomically(place, self._text())
+        try:
+            load_agent(self.directory.agent, task=self.agent.task)
+        except AgentError as error:
+            _log.warning("%s The agent is saved again.", error)
+            self._save_agent()
 
     def _evaluate(self, name: str, agent: Agent) -> dict[str, float]:
         settings, task = self.settings, self.agent.task
@@ -199,7 +220,13 @@ class EvaluatePhase:
             _log.info("The agent, and its violations of constraints:\n%s", table)
         return beside
 
-    def _save(self, beside: Mapping[str, dict[str, Any]]) -> None:
+    def _save(self) -> None:
+        self._save_agent()
+        write_atomically(self.directory.evaluation, self._text())
+        label = f"{self.config.task}-{self.config.label}"
+        self.new_files.append(NewFile(label, self.directory.agent))
+
+    def _save_agent(self) -> None:
         origin = (self.directory.read_metadata().get("sessions") or [{}])[0]
         metadata = {
             "seed": self.config.seed,
@@ -208,19 +235,29 @@ class EvaluatePhase:
             "command": origin.get("command"),
             "samples": self.samples,
             "config": _public(self.config.to_mapping()),
-            "returns": self.results,
+            "returns": _as_json(self.results),
             **self.agent.metadata,
         }
         save_agent(self.agent, self.directory.agent, metadata=metadata)
-        results = {**self.results, **({BASELINES_KEY: beside} if beside else {})}
-        write_atomically(self.directory.evaluation, json.dumps(results, indent=2) + "\n")
-        label = f"{self.config.task}-{self.config.label}"
-        self.new_files.append(NewFile(label, self.directory.agent))
+
+    def _text(self) -> str:
+        """The content of ``evaluation.json``."""
+        results = {**self.results, **({BASELINES_KEY: self.beside} if self.beside else {})}
+        return json.dumps(_as_json(results), indent=2) + "\n"
 
     def _show(self) -> None:
         video, place = self.settings.video, self.directory.path
         for path in show_episode(self.agent, place, world=self.world, video=video):
             self.new_files.append(NewFile(f"evaluate/{path.stem}{path.suffix}", path))
+
+
+def _as_json(value: Any) -> Any:
+    """Plain values with null in the place of numbers that are not finite, which JSON lacks."""
+    if isinstance(value, Mapping):
+        return {key: _as_json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_as_json(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _public(config: dict[str, Any]) -> dict[str, Any]:

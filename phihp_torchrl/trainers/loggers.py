@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -72,7 +72,12 @@ class WandbRunLogger(RunLogger):
     """Logs to wandb through TorchRL's logger, with real steps as the axis of every metric."""
 
     def __init__(
-        self, config: LoggerConfig, run: Mapping[str, Any], directory: Path, run_id: str | None
+        self,
+        config: LoggerConfig,
+        run: Mapping[str, Any],
+        directory: Path,
+        run_id: str | None,
+        rows: Sequence[Mapping[str, str]] = (),
     ) -> None:
         import wandb
 
@@ -98,6 +103,11 @@ class WandbRunLogger(RunLogger):
         self.id = self._run.id
         self._run.define_metric(REAL_STEPS)
         self._run.define_metric("*", step_metric=REAL_STEPS)
+        if getattr(self._run, "offline", False):
+            # Every session has a folder of its own, and that of a killed process may hold nothing:
+            # the last folder must have the whole run, for a sync replaces what came before.
+            for row in rows:
+                self.log({key: _number(text) for key, text in row.items()}, int(row["unit"]))
 
     def log(self, metrics: Mapping[str, Any], unit: int) -> None:
         # wandb ignores a unit that it has already: what a resumed run earns again is the same.
@@ -161,6 +171,7 @@ def make_logger(
     *,
     run_id: str | None = None,
     resume_unit: int | None = None,
+    rows: Sequence[Mapping[str, str]] = (),
 ) -> RunLogger:
     """Open the logger of ``config``; if it fails, log a warning and use ``metrics.csv`` only.
 
@@ -172,11 +183,12 @@ def make_logger(
         directory: the run directory.
         run_id: :attr:`RunLogger.id` of the run to go on with.
         resume_unit: the first unit that will be logged, in a resumed run.
+        rows: the rows of ``metrics.csv`` before it, as texts.
     """
     try:
         if config.name == "wandb":
             _check_wandb_key(config)
-            return WandbRunLogger(config, run, directory, run_id)
+            return WandbRunLogger(config, run, directory, run_id, rows)
         if config.name == "tensorboard":
             return TensorboardRunLogger(directory, resume_unit)
     # A logger must never end a run, whatever its package or the network comes up with.
@@ -188,6 +200,16 @@ def make_logger(
             directory / "metrics.csv",
         )
     return RunLogger()
+
+
+def _number(text: str) -> float | str:
+    """The number that a cell of ``metrics.csv`` stands for, or its text."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
 
 
 def _check_wandb_key(config: LoggerConfig) -> None:

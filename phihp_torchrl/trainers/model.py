@@ -134,6 +134,10 @@ class ModelTrainer:
         """Return all real transitions, ``[N]``, as replay keeps them: with rewards less prices."""
         return replay_batch(self.task, self.data)
 
+    def trained(self) -> dict[str, Tensor]:
+        """The parameters of the model, by name."""
+        return dict(self.dynamics.named_parameters())
+
     def constants_covariance(self) -> Tensor:
         """Covariance of the prior's learned constants after the last fit, ``[learned, learned]``.
 

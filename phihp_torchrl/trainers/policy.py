@@ -198,6 +198,11 @@ class PolicyTrainer:
         """Actor and critics, as arguments of :class:`~phihp_torchrl.deployment.Agent`."""
         return {"actor": self.best_actor(), "qvalue": self.best_qvalue()}
 
+    def trained(self) -> dict[str, Tensor]:
+        """The layers of actor and critics, their targets and moments, by name."""
+        groups = self.update.networks._asdict().items()
+        return {f"{name}.{i}": layer for name, group in groups for i, layer in enumerate(group)}
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
         return {

@@ -80,4 +80,5 @@ class ActorEvaluation:
         if signals is not None:
             states, later = world.task.with_signals(states, signals[0]), signals[1:]
         score = world.returns(actor, states, self.steps, signals=later).total
-        return self.scales.reward * torch.nan_to_num(score, nan=-math.inf).mean().item()
+        # Neither NaN nor an infinite return may win.
+        return self.scales.reward * torch.where(score.isfinite(), score, -math.inf).mean().item()

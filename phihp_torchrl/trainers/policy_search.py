@@ -154,6 +154,10 @@ class PolicySearch:
         names = [name for name, _ in self.ways[: self.tried + 1]]
         return {"tried": names, "kept": self._kept().name, "at_floor": self.stuck}
 
+    def trained(self) -> dict[str, Tensor]:
+        """The layers that the present way trains, by name."""
+        return self.trainer.trained()
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
         best = self.best
@@ -221,7 +225,7 @@ class PolicySearch:
         returns = trainer.rollouts.returns(actor, self._states, steps).total
         returns = returns * (trainer.scales.reward / self._unit)  # the floor's unit
         share = self._floor.share(returns)
-        score = float(torch.nan_to_num(returns, nan=-math.inf).mean()) * self._unit
+        score = float(torch.where(returns.isfinite(), returns, -math.inf).mean()) * self._unit
         stuck = share > _AT_END if at_end else share >= _HALF_WAY
         if at_end or stuck:
             if self.best is None or score >= self.best.score:

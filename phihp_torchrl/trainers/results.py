@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +15,20 @@ def read_result(path: Path) -> TaskResult | None:
     """Read the returns of the agent of the run in ``path``; ``None`` if it was not evaluated.
 
     Raises:
-        ConfigError: if there is no run in ``path``.
+        ConfigError: if there is no run in ``path``, or its evaluation was not written to its end.
     """
     directory = RunDirectory(path)
     config = directory.read_config()
-    if not directory.evaluation.is_file():
+    results = directory.read_evaluation()
+    if results is None:
         return None
-    results = json.loads(directory.evaluation.read_text())
     results.pop(BASELINES_KEY, None)  # they are not what was learned
     if not results:  # a world in which nobody can act
         return None
-    means = {name: (result["return_mean"],) for name, result in results.items()}
+    means = {
+        name: (math.nan if (mean := result["return_mean"]) is None else mean,)
+        for name, result in results.items()
+    }
     samples = directory.read_metadata()["real_steps"]
     method = METHODS.get(config.get("method", "phihp"))
     label = config["method"] if method is None else method.label
@@ -42,8 +45,8 @@ def read_controllers(path: Path) -> dict[str, dict[str, Any]] | None:
         path: directory of the run.
     """
     directory = RunDirectory(path)
-    if not directory.evaluation.is_file():
+    results = directory.read_evaluation()
+    if results is None:
         return None
-    results = json.loads(directory.evaluation.read_text())
     beside = results.pop(BASELINES_KEY, None)
     return None if beside is None else {**results, **beside}

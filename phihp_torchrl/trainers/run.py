@@ -25,14 +25,19 @@ from phihp_torchrl.trainers.checkpoints import (
     save_state,
 )
 from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.files import check_contained
+from phihp_torchrl.trainers.finite import check_finite
 from phihp_torchrl.trainers.interrupt import Interrupt
+from phihp_torchrl.trainers.lock import RunLock
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
+from phihp_torchrl.trainers.metrics_table import MetricsTable
 from phihp_torchrl.trainers.phases import PHASES, Phase, real_steps
 from phihp_torchrl.trainers.rehearsal import rehearse
 from phihp_torchrl.trainers.run_checks import check_run
 from phihp_torchrl.trainers.run_config import RunConfig, task_of
-from phihp_torchrl.trainers.run_directory import MetricsTable, RunDirectory
-from phihp_torchrl.trainers.start import check_same, start_directory
+from phihp_torchrl.trainers.run_directory import RunDirectory
+from phihp_torchrl.trainers.run_record import RunRecord
+from phihp_torchrl.trainers.start import begin, check_same, new_directory
 from phihp_torchrl.worlds import World, make_world
 
 _log = logging.getLogger(__name__)
@@ -91,9 +96,11 @@ def run(
         The directory, whether the run is finished, and the last metrics.
 
     Raises:
-        ConfigError: before any real step, if the directory holds another run, or ``config`` differs
-            from that of the run to resume.
+        ConfigError: before any real step, if the directory holds another run, ``config`` differs
+            from that of the run to resume, or another process works on it.
         CheckpointError: if no checkpoint of the run can be read.
+        NonFiniteError: if a loss or a weight leaves the finite numbers; the checkpoints are those
+            of before.
 
     Examples:
         >>> import tempfile
@@ -117,10 +124,13 @@ def run(
             raise ConfigError("resume", "expected the directory of a run.")
         directory = RunDirectory(path, config.keep_checkpoints)
         check_same(config, directory)
+        check_contained(directory.path)
     else:
         rehearse(config, world)
-        config, directory = start_directory(config, path)
-    with Interrupt() as interrupt:
+        config, directory = new_directory(config, path)
+    with RunLock(directory.path), Interrupt() as interrupt:
+        if not resume:
+            begin(config, directory)
         return _Run(config, world, directory, interrupt).run()
 
 
@@ -138,9 +148,9 @@ class _Run:
         self.phases: dict[str, Phase] = {}
         self.position = _Position(0, 0, {})
         self.latest: dict[str, float] = {}
+        self.record = RunRecord(directory)
 
     def run(self) -> RunResult:
-        metadata = self.directory.read_metadata()
         table, logger, finished = None, RunLogger(), True
         try:
             for name in (*self.config.phases_before, *self.config.phases_to_do):
@@ -148,21 +158,22 @@ class _Run:
                 phase = self._make_phase(name)
                 self.phases[name] = phase
                 if self.directory.phase(name).exists():
-                    self._restore(
-                        phase, load_state(self.directory.phase(name), metadata=self.origin)
-                    )
+                    state = load_state(self.directory.phase(name), metadata=self.origin)
+                    self._restore(phase, state, ours=name in self.config.phases_to_do)
                     continue
                 self._resume_phase(name, phase)
+                if table is None:
+                    table, logger = self._open_logs()
                 if hasattr(phase, "keep"):
                     phase.keep = partial(self._save, name, phase)
-                if table is None:
-                    table, logger = self._open_logs(metadata)
                 finished = self._advance(name, phase, table, logger)
                 if not finished:
                     break
-                self._finish(name, phase, metadata)
+                self._finish(name, phase)
         finally:
             logger.close()
+        if table is None:  # everything was done before
+            self.record.complete(self.phases, self.position.unit)
         return RunResult(self.directory.path, finished, self.interrupt.signal, self.latest)
 
     def _make_phase(self, name: str) -> Phase:
@@ -194,6 +205,13 @@ class _Run:
                     return False
                 start = time.monotonic()
                 metrics = phase.advance()
+                check_finite(
+                    phase,
+                    metrics,
+                    name=name,
+                    unit=PHASES[name].unit,
+                    directory=self.directory.path,
+                )
                 position.seconds[name] = position.seconds.get(name, 0.0) + time.monotonic() - start
                 position.real_steps = real_steps(self.phases)
                 self._log_unit(name, metrics, table, logger)
@@ -231,14 +249,15 @@ class _Run:
                 "%s could not log unit %d: %s", type(logger).__name__, position.unit, error
             )
 
-    def _finish(self, name: str, phase: Phase, metadata: dict[str, Any]) -> None:
+    def _finish(self, name: str, phase: Phase) -> None:
         self._save(name, phase, self.directory.phase(name))
         clear_rotation(self.directory.rotation)
-        metadata["seconds"] = {k: round(v, 3) for k, v in self.position.seconds.items()}
-        metadata["real_steps"] = self.position.real_steps
-        if hasattr(phase, "summary"):
-            metadata[name] = phase.summary
-        self.directory.write_metadata(metadata)
+        self._note(name, phase)
+        self.record.write()
+
+    def _note(self, name: str, phase: Phase) -> None:
+        position = self.position
+        self.record.note(name, phase, seconds=position.seconds, steps=position.real_steps)
 
     def _save(self, name: str, phase: Phase, path: Path | None = None) -> None:
         state = {
@@ -246,6 +265,7 @@ class _Run:
             "trainer": phase.state_dict(),
             "random": GlobalRNGState().state_dict(),
             "position": vars(self.position),
+            **self.record.state_dict(),
         }
         place = path or self.directory.rotation
         save_state(place, state, metadata=self.origin, step=self.position.unit)
@@ -255,35 +275,41 @@ class _Run:
         found = load_latest(self.directory.rotation, metadata=self.origin)
         # A checkpoint of an earlier phase was outlived by that phase's final state.
         if found is not None and found[1].get("phase") == name:
-            self._restore(phase, found[1])
-            GlobalRNGState().load_state_dict(found[1]["random"])
+            self._restore(phase, found[1], ours=True)
 
-    def _restore(self, phase: Phase, state: Mapping[str, Any]) -> None:
+    def _restore(self, phase: Phase, state: Mapping[str, Any], *, ours: bool) -> None:
+        """Continue from a state, of this run or (``ours`` false) of the one it begins from."""
+        if ours:
+            self.record.load_state_dict(state)
         try:
             phase.load_state_dict(state["trainer"])
             self.position = _Position(**state["position"])
+            if not phase.done:
+                GlobalRNGState().load_state_dict(state["random"])
         except Exception as error:  # a hostile state may fail in any way
             raise CheckpointError(
                 f"{self.directory.path}: its checkpoint of phase {state.get('phase')!r} does not "
                 f"fit its config.yaml: {error}"
             ) from error
+        if ours and phase.done:
+            self._note(state["phase"], phase)
 
-    def _open_logs(self, metadata: dict[str, Any]) -> tuple[MetricsTable, RunLogger]:
-        unit = self.position.unit
-        table = MetricsTable(self.directory.metrics, rows=unit)
-        resumed = bool(metadata.get("sessions"))
+    def _open_logs(self) -> tuple[MetricsTable, RunLogger]:
+        unit, metadata = self.position.unit, self.record.metadata
+        table = self.record.open_table(unit)
         logger = make_logger(
             self.config.logger,
             self.config.to_mapping(),
             self.directory.path,
             run_id=metadata.get("logger_id"),
-            resume_unit=unit if resumed else None,
+            resume_unit=unit if metadata.get("sessions") else None,
+            rows=table.rows,
         )
         metadata["logger_id"] = logger.id or metadata.get("logger_id")
         metadata.setdefault("sessions", []).append(
             {**describe_origin(self.config.seed), "first_unit": unit}
         )
-        self.directory.write_metadata(metadata)
+        self.record.write()
         return table, logger
 
 

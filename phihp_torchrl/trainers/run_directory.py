@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
@@ -12,10 +10,10 @@ from typing import Any
 
 from omegaconf import OmegaConf
 from torchrl.checkpoint import CheckpointRotation
-from yaml import YAMLError
 
-from phihp_torchrl.config import ConfigError
-from phihp_torchrl.trainers.yaml_file import read_yaml
+from phihp_torchrl.config import ConfigError, digest_of, sealed, unsealed
+from phihp_torchrl.trainers.files import write_atomically
+from phihp_torchrl.trainers.stored import read_stored
 
 # What runs did before there were these settings, whose defaults are others.
 _BEFORE = {
@@ -30,7 +28,8 @@ class RunDirectory:
 
     ========================= =====================================================================
     ``config.yaml``           the whole configuration
-    ``metadata.json``         seed, commit, command, machine, versions, seconds of each phase
+    ``metadata.json``         seed, commit, command, machine, versions, seconds of each phase,
+                              and the settings and code that the run was started with
     ``metrics.csv``           a row for each unit of work
     ``checkpoints/``          the latest states of the current phase
     ``phases/<phase>/``       the final state of each finished phase
@@ -65,30 +64,60 @@ class RunDirectory:
         """
         if not self.config.is_file():
             raise ConfigError(str(self.path), "not the directory of a run, it has no config.yaml.")
-        try:
-            config = read_yaml(self.config)
-        except (YAMLError, OSError, ValueError) as error:
-            raise ConfigError(str(self.config), f"cannot be read: {error}") from error
-        if not isinstance(config, dict):
-            raise ConfigError(str(self.config), f"expected keys and values, got {config!r}.")
-        return _complete(config)
+        return _complete(read_stored(self.config))
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Write the configuration, as YAML."""
         write_atomically(self.config, OmegaConf.to_yaml(OmegaConf.create(dict(config))))
 
     def read_metadata(self) -> dict[str, Any]:
-        """Read the metadata; empty if there are none."""
+        """Read the metadata; empty if there are none.
+
+        Raises:
+            ConfigError: if they were damaged or edited.
+        """
         try:
-            return json.loads(self.metadata.read_text())
+            return unsealed(self.metadata.read_text())
         except FileNotFoundError:
             return {}
-        except ValueError as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise ConfigError(str(self.metadata), f"cannot be read: {error}") from error
 
     def write_metadata(self, metadata: Mapping[str, Any]) -> None:
-        """Write the origin and the duration of the run, as JSON."""
-        write_atomically(self.metadata, json.dumps(metadata, indent=2) + "\n")
+        """Write the origin and the duration of the run, as JSON with its digest."""
+        write_atomically(self.metadata, sealed(metadata))
+
+    def read_evaluation(self) -> dict[str, Any] | None:
+        """Read what the agent and the baselines earned; ``None`` if it was not evaluated.
+
+        Raises:
+            ConfigError: if the file was damaged or edited, or was not written to its end.
+        """
+        try:
+            text = self.evaluation.read_text()
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            raise ConfigError(str(self.evaluation), f"cannot be read: {error}") from error
+        expected = (self.read_metadata().get("digests") or {}).get(self.evaluation.name)
+        try:
+            if expected is not None and digest_of(text) != expected:
+                raise ValueError("its digest is another: it was damaged or edited")
+            results = json.loads(text)
+            if not isinstance(results, dict):
+                raise ValueError(f"expected a JSON object, got {type(results).__name__}")
+        except (ValueError, RecursionError) as error:
+            raise ConfigError(
+                str(self.evaluation),
+                f"cannot be read: {error}. Resuming the run writes it again: resume={self.path}.",
+            ) from error
+        return results
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether the run has done anything that would be lost with its directory."""
+        checkpoints = self.rotation.directory.glob(f"{self.rotation.prefix}-*")
+        return any(checkpoints) or any((self.path / "phases").glob("*"))
 
 
 def _complete(config: dict[str, Any]) -> dict[str, Any]:
@@ -116,65 +145,3 @@ def new_run_directory(task: str, label: str) -> Path:
             continue
         return path
     raise ConfigError("run_dir", f"{parent / name} and 998 more are taken; name one.")
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Replace the file at ``path`` in one step: readers see the old text or the new."""
-    stage = path.with_name(f".{path.name}.stage")
-    stage.write_text(text)
-    os.replace(stage, path)
-
-
-class MetricsTable:
-    """A CSV file with a row for each unit of work; new metrics become new columns.
-
-    Args:
-        path: the file.
-        rows: number of rows to keep of an existing file: those before the checkpoint from which the
-            run is resumed. Later rows are computed again.
-
-    Examples:
-        >>> import tempfile
-        >>> table = MetricsTable(Path(tempfile.mkdtemp()) / "metrics.csv")
-        >>> table.append({"unit": 0, "loss": 1.5})
-        >>> table.append({"unit": 1, "return": -300.0})
-        >>> print(table.path.read_text())
-        unit,loss,return
-        0,1.5,
-        1,,-300.0
-        <BLANKLINE>
-    """
-
-    def __init__(self, path: Path, rows: int = 0) -> None:
-        self.path = path
-        self._columns: list[str] = []
-        kept: list[dict[str, str]] = []
-        if rows and path.exists():
-            with path.open(newline="") as file:
-                reader = csv.DictReader(file)
-                kept = [row for _, row in zip(range(rows), reader, strict=False)]
-                # Drop columns of later rows only; they are added again with those rows.
-                columns = reader.fieldnames or []
-                self._columns = [c for c in columns if any(row[c] for row in kept)]
-        self._write(kept)
-
-    def append(self, row: Mapping[str, Any]) -> None:
-        """Add a row."""
-        if new := [name for name in row if name not in self._columns]:
-            with self.path.open(newline="") as file:
-                old = list(csv.DictReader(file))
-            self._columns += new
-            self._write(old)
-        with self.path.open("a", newline="") as file:
-            csv.DictWriter(file, self._columns, lineterminator="\n").writerow(row)
-
-    def _write(self, rows: list[dict[str, str]]) -> None:
-        stage = self.path.with_name(f".{self.path.name}.stage")
-        with stage.open("w", newline="") as file:
-            if self._columns:
-                writer = csv.DictWriter(
-                    file, self._columns, lineterminator="\n", extrasaction="ignore"
-                )
-                writer.writeheader()
-                writer.writerows(rows)
-        os.replace(stage, self.path)

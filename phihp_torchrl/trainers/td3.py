@@ -232,6 +232,11 @@ class RealTD3Trainer(TD3Trainer):
         states, steps = self._evaluation_states, self.task.max_steps
         return self._played.returns(self.update.networks.actor, states, steps).total
 
+    def trained(self) -> dict[str, Tensor]:
+        """The layers of actor and critics, their targets and moments, by name."""
+        groups = self.update.networks._asdict().items()
+        return {f"{name}.{i}": layer for name, group in groups for i, layer in enumerate(group)}
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs, tensors and numbers only."""
         return {**super().state_dict(), "seconds": self.seconds}

@@ -16,7 +16,7 @@ from phihp_torchrl.trainers import PHASES, LoggerConfig, RunConfig
 from phihp_torchrl.worlds import WORLDS
 
 FILES = sorted(YAML.rglob("*.yaml"))
-PLACES = {"run_dir": None, "resume": None}
+PLACES = {"run_dir": None, "resume": None, "trust": False}
 """Settings that say where a run is, and are no part of it."""
 
 

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from phihp_torchrl.trainers import run
+from phihp_torchrl.config import METHODS, choices
+from phihp_torchrl.trainers import PHASES, run
 
 from .run_parts import CONFIG
+from .tally import register_tally
 
 
 @pytest.fixture(scope="session")
@@ -17,3 +19,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("runs") / "whole"
     assert run(CONFIG, path).finished
     return path
+
+
+@pytest.fixture
+def tally(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The smallest method is registered, for one test."""
+    for registry in (METHODS, PHASES):
+        monkeypatch.setattr(registry, "_entries", dict(registry._entries))
+    monkeypatch.setattr(choices, "_OFFERED", dict(choices._OFFERED))
+    register_tally()

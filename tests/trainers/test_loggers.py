@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from phihp_torchrl.trainers import LoggerConfig, RunLogger, make_logger, run
-from phihp_torchrl.trainers.run_directory import MetricsTable
+from phihp_torchrl.trainers.metrics_table import MetricsTable
 
 from .run_parts import CONFIG, run_module
 
@@ -21,7 +21,7 @@ def test_the_table_grows_columns_and_forgets_rows(tmp_path: Path) -> None:
     table.append({"unit": 0, "a": 1.0})
     before = table.path.read_text()
     table.append({"unit": 1, "a": 2.0, "b": 3.0})
-    MetricsTable(table.path, rows=1)
+    MetricsTable(table.path, table.rows[:1])
     assert table.path.read_text() == before
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from grid.cell import CellFiles
 from grid.claim import is_claimed
+from phihp_torchrl.config import ConfigError
+from phihp_torchrl.trainers import RunDirectory
 
 
 class Status(Enum):
@@ -37,7 +39,7 @@ class CellState:
 
 def look(files: CellFiles) -> CellState:
     """The state of a cell now. It locks nothing that a worker would wait for long."""
-    if files.evaluation.is_file():
+    if is_done(files):
         return CellState(Status.DONE, _earned(files.evaluation))
     if is_claimed(files.lock):
         return CellState(Status.RUNNING, _how_far(files.run / "metrics.csv"))
@@ -46,6 +48,17 @@ def look(files: CellFiles) -> CellState:
     if (files.run / "config.yaml").is_file():
         return CellState(Status.STOPPED, _how_far(files.run / "metrics.csv"))
     return CellState(Status.WAITING)
+
+
+def is_done(files: CellFiles) -> bool:
+    """Whether what is kept of a finished run is whole, by its last file.
+
+    One that was torn, as when a disk was full, is not done: it is kept again.
+    """
+    try:
+        return RunDirectory(files.kept).read_evaluation() is not None
+    except ConfigError:
+        return False
 
 
 def read_failure(path: Path) -> str:

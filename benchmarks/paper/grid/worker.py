@@ -19,10 +19,10 @@ from grid.cell import CellFiles
 from grid.claim import claim
 from grid.config import GridConfig
 from grid.keep import is_whole, keep
-from grid.status import CellState, Status, look
+from grid.status import CellState, Status, is_done, look
 from phihp_torchrl.config import ConfigError, compose_yaml, override_lines
 from phihp_torchrl.origin import describe_origin
-from phihp_torchrl.trainers import RunRequest, read_request, run
+from phihp_torchrl.trainers import RunDirectory, RunRequest, read_request, run
 
 _log = logging.getLogger(__name__)
 _LOGGERS = ("phihp_torchrl", "grid")
@@ -52,7 +52,7 @@ def work(config: GridConfig, root: Path) -> CellState:
         return look(files)
     with claim(files.lock, config.claim_wait) as ours:
         # Only now: another process may have finished the cell, or failed at it, meanwhile.
-        if ours and files.evaluation.is_file():
+        if ours and is_done(files):
             if not is_whole(files):
                 keep(files)
         elif ours and (config.retry_failed or not files.failure.is_file()):
@@ -92,9 +92,10 @@ def _request(config: GridConfig, files: CellFiles) -> RunRequest:
 
     The words hold for a resumed run too, which refuses to be another one than it was.
     """
-    place = "resume"
-    if not (files.run / "config.yaml").is_file():
-        # Killed before its first file was whole: there is nothing to lose in it.
+    place, directory = "resume", RunDirectory(files.run)
+    if not directory.config.is_file() or not directory.is_begun:
+        # Killed or failed before its first checkpoint: there is nothing to lose in it, and its
+        # settings may be others now.
         shutil.rmtree(files.run, ignore_errors=True)
         place = "run_dir"
     words = [*config.words(), *override_lines({place: str(files.run)})]

@@ -228,3 +228,30 @@ def test_a_proof_plays_the_episodes_that_are_kept_for_it(config: GridConfig) -> 
     assert not any(word.startswith("evaluate.first_seed") for word in config.words())
     with pytest.raises(ConfigError, match=r"allow_dirty: expected false with proof=true"):
         replace(config, proof=True)
+
+
+def test_a_cell_that_failed_at_its_start_can_be_corrected(
+    config: GridConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its settings are on disk already, and nothing else is."""
+    module = sys.modules["phihp_torchrl.trainers.run"]
+    with monkeypatch.context() as patch:
+        patch.setattr(module._Run, "_make_phase", lambda *_: 1 / 0)
+        assert do(config).status is Status.FAILED
+    files = config.files(Path())
+    assert (files.run / "config.yaml").is_file()
+    corrected = replace(config, overrides=(*TINY, "policy.updates=16"), retry_failed=True)
+    assert do(corrected).status is Status.DONE
+    assert "updates: 16" in (files.kept / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize("also_in_full", [False, True])
+def test_a_torn_evaluation_is_not_done(config: GridConfig, also_in_full: bool) -> None:
+    do(config)
+    files = config.files(Path())
+    text = files.evaluation.read_text()
+    for path in (files.evaluation, *([files.run / "evaluation.json"] if also_in_full else [])):
+        path.write_text(text[: len(text) // 2])
+    assert look(files).status is not Status.DONE
+    assert do(config).status is Status.DONE
+    assert files.evaluation.read_text() == text

@@ -1,0 +1,56 @@
+"""Files of a run that are whole or not there, in a folder that nothing leads out of."""
+
+from __future__ import annotations
+
+import os
+import stat
+import uuid
+from pathlib import Path
+
+from phihp_torchrl.config import ConfigError
+
+STAGE = ".stage"
+"""Ending of files that are being written."""
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace the file at ``path`` in one step: readers see the old text or the new."""
+    # A name that nobody can know, and a file that must be new: no link is written through.
+    stage = path.with_name(f".{path.name}.{uuid.uuid4().hex}{STAGE}")
+    try:
+        with stage.open("x", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(stage, path)
+    finally:
+        stage.unlink(missing_ok=True)
+
+
+def check_contained(directory: str | Path) -> None:
+    """Refuse a folder with links that lead out of it, and with what is neither file nor folder.
+
+    A run writes into its folder and removes old files there, which such a link would lead
+    elsewhere.
+
+    Raises:
+        ConfigError: for the first such entry.
+    """
+    top = Path(directory)
+    root = top.resolve()
+    for parent, folders, names in os.walk(top):  # which follows no links
+        for path in (Path(parent, name) for name in (*folders, *names)):
+            mode = path.lstat().st_mode
+            if stat.S_ISLNK(mode):
+                if not path.resolve().is_relative_to(root):
+                    raise ConfigError(
+                        str(path), f"a link out of the folder of the run, to {os.readlink(path)}."
+                    )
+            elif not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise ConfigError(str(path), "expected a file or a folder, it is neither.")
+
+
+def remove_stages(directory: Path) -> None:
+    """Remove what killed processes were writing."""
+    for path in directory.glob(f".*{STAGE}"):
+        path.unlink(missing_ok=True)
