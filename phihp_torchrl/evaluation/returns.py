@@ -20,6 +20,9 @@ from phihp_torchrl.evaluation.violations import Violations
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld, World
 
+DOING = "playing episodes"
+"""What a run says that it is doing while this is on its stack."""
+
 
 @dataclass(frozen=True)
 class Evaluation:
