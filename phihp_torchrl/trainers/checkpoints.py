@@ -8,7 +8,7 @@ import logging
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors.torch import load as load_tensors
@@ -37,8 +37,8 @@ class SafeStateAdapter(CheckpointAdapter):
         self, component: Any, path: Path, *, args: tuple[Any, ...], kwargs: Mapping[str, Any]
     ) -> Any:
         path.mkdir(parents=True, exist_ok=True)
-        tensors: dict[str, Tensor] = {}
-        tree = _encode(component.state_dict(), tensors)
+        state = component.state_dict()
+        tree, tensors = state if isinstance(state, Frozen) else freeze(state)
         data = save_tensors(tensors)
         (path / "tensors.safetensors").write_bytes(data)
         digest = hashlib.sha256(data).hexdigest()
@@ -63,13 +63,42 @@ class SafeStateAdapter(CheckpointAdapter):
         component.load_state_dict(_decode(record["tree"], load_tensors(data)))
 
 
+class Frozen(NamedTuple):
+    """A state as it was at a moment: nothing that happens to its tensors later changes it.
+
+    Attributes:
+        tree: the state as JSON, in which tensors have names.
+        tensors: copies of the tensors on the CPU, by name.
+    """
+
+    tree: Any
+    tensors: dict[str, Tensor]
+
+
+def freeze(state: Mapping[str, Any]) -> Frozen:
+    """Copy a state, to be saved later or never.
+
+    Args:
+        state: as of :func:`save_state`.
+
+    Examples:
+        >>> weight = torch.zeros(1)
+        >>> frozen = freeze({"weight": weight})
+        >>> weight += 1
+        >>> frozen.tensors
+        {'0': tensor([0.])}
+    """
+    tensors: dict[str, Tensor] = {}
+    return Frozen(_encode(state, tensors), tensors)
+
+
 class State:
     """Holds a state while a checkpoint is written or read."""
 
-    def __init__(self, state: Mapping[str, Any] | None = None) -> None:
-        self.state = state or {}
+    def __init__(self, state: Mapping[str, Any] | Frozen | None = None) -> None:
+        self.state: Any = state or {}
 
-    def state_dict(self) -> Mapping[str, Any]:
+    def state_dict(self) -> Any:
         return self.state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -78,7 +107,7 @@ class State:
 
 def save_state(
     directory: CheckpointRotation | Path,
-    state: Mapping[str, Any],
+    state: Mapping[str, Any] | Frozen,
     *,
     metadata: Mapping[str, Any],
     step: int = 0,
@@ -87,7 +116,8 @@ def save_state(
 
     Args:
         directory: the rotation, or the path of a single checkpoint.
-        state: nested dictionaries, lists and tuples of tensors, tensordicts, numbers and texts.
+        state: nested dictionaries, lists and tuples of tensors, tensordicts, numbers and texts; or
+            such a state as :func:`freeze` has copied it.
         metadata: description of the state; :func:`load_state` requires an equal one.
         step: position in the rotation.
     """

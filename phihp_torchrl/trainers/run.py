@@ -14,24 +14,24 @@ from typing import Any
 import numpy as np
 import torch
 from torchrl.checkpoint import CheckpointError, GlobalRNGState
-from tqdm.auto import tqdm
 
 from phihp_torchrl.config import ConfigError, resolve_seconds
+from phihp_torchrl.display import Progress
 from phihp_torchrl.origin import describe_origin
-from phihp_torchrl.trainers.checkpoints import (
-    clear_rotation,
-    load_latest,
-    load_state,
-    save_state,
-)
+from phihp_torchrl.trainers.checkpoints import clear_rotation, load_latest, load_state
 from phihp_torchrl.trainers.context import Context
-from phihp_torchrl.trainers.interrupt import Interrupt
+from phihp_torchrl.trainers.expected import expect
+from phihp_torchrl.trainers.headline import headline
+from phihp_torchrl.trainers.interrupt import Abandoned, Interrupt
+from phihp_torchrl.trainers.keeper import Keeper
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
 from phihp_torchrl.trainers.phases import PHASES, Phase, real_steps
+from phihp_torchrl.trainers.report import report_run
 from phihp_torchrl.trainers.run_checks import check_run
 from phihp_torchrl.trainers.run_config import RunConfig, task_of
 from phihp_torchrl.trainers.run_directory import MetricsTable, RunDirectory
 from phihp_torchrl.trainers.start import check_same, start_directory
+from phihp_torchrl.trainers.warned import Warned
 from phihp_torchrl.worlds import World, make_world
 
 _log = logging.getLogger(__name__)
@@ -118,21 +118,36 @@ def run(
         check_same(config, directory)
     else:
         config, directory = start_directory(config, path)
-    with Interrupt() as interrupt:
-        return _Run(config, world, directory, interrupt).run()
+    expected = expect(config, directory.path)
+    progress = Progress(expected.middle, enabled=config.progress)
+    with Interrupt() as interrupt, progress, Warned() as warned:
+        progress.say(f"{config.task}, {config.label}, in {directory.path}. {expected.words()}")
+        result = _Run(config, world, directory, interrupt, progress, warned).run()
+    if result.finished:
+        report_run(directory, world)
+    return result
 
 
 class _Run:
     """The loop over phases, and over the units of each."""
 
     def __init__(
-        self, config: RunConfig, world: World, directory: RunDirectory, interrupt: Interrupt
+        self,
+        config: RunConfig,
+        world: World,
+        directory: RunDirectory,
+        interrupt: Interrupt,
+        progress: Progress,
+        warned: Warned,
     ) -> None:
         self.config = config
         self.world = world
         self.directory = directory
         self.interrupt = interrupt
+        self.progress = progress
+        self.warned = warned
         self.origin = {"task": config.task}
+        self.keeper = Keeper(directory.rotation, self.origin, interrupt)
         self.phases: dict[str, Phase] = {}
         self.position = _Position(0, 0, {})
         self.latest: dict[str, float] = {}
@@ -143,12 +158,14 @@ class _Run:
         try:
             for name in (*self.config.phases_before, *self.config.phases_to_do):
                 _seed_everything(self.config.seed)
-                phase = self._make_phase(name)
+                with self.interrupt.work():
+                    phase = self._make_phase(name)
                 self.phases[name] = phase
                 if self.directory.phase(name).exists():
                     self._restore(
                         phase, load_state(self.directory.phase(name), metadata=self.origin)
                     )
+                    self.progress.restored(name, self.position.seconds.get(name, 0.0))
                     continue
                 self._resume_phase(name, phase)
                 if hasattr(phase, "keep"):
@@ -159,7 +176,11 @@ class _Run:
                 if not finished:
                     break
                 self._finish(name, phase, metadata)
+        except Abandoned:
+            finished = False
+            self.keeper.save_frozen()
         finally:
+            self._note_warnings(metadata)
             logger.close()
         return RunResult(self.directory.path, finished, self.interrupt.signal, self.latest)
 
@@ -181,27 +202,25 @@ class _Run:
     def _advance(self, name: str, phase: Phase, table: MetricsTable, logger: RunLogger) -> bool:
         """Work through a phase; false if a signal ended it early."""
         position, saved = self.position, time.monotonic()
-        done, total = phase.progress
-        hidden = None if self.config.progress else True  # None: shown on a terminal alone
-        with tqdm(
-            desc=name, initial=done, total=total, unit=f" {PHASES[name].unit}", disable=hidden
-        ) as bar:
-            while not phase.done:
-                if self.interrupt:
-                    self._save(name, phase)
-                    return False
-                start = time.monotonic()
+        self.progress.begin(name, phase.progress, PHASES[name].unit)
+        while not phase.done:
+            if self.interrupt:
+                self._save(name, phase)
+                return False
+            self.keeper.freeze(partial(self._state, name, phase), position.unit)
+            start = time.monotonic()
+            with self.interrupt.work():
                 metrics = phase.advance()
-                position.seconds[name] = position.seconds.get(name, 0.0) + time.monotonic() - start
-                position.real_steps = real_steps(self.phases)
-                self._log_unit(name, metrics, table, logger)
-                position.unit += 1
-                bar.total = phase.progress[1]
-                bar.update(phase.progress[0] - bar.n)
-                bar.set_postfix_str(_summary(metrics))
-                if time.monotonic() - saved >= self.config.checkpoint_interval:
-                    self._save(name, phase)
-                    saved = time.monotonic()
+            seconds = position.seconds.get(name, 0.0) + time.monotonic() - start
+            position.seconds[name] = seconds
+            position.real_steps = real_steps(self.phases)
+            self._log_unit(name, metrics, table, logger)
+            position.unit += 1
+            self.progress.advance(phase.progress, headline(self.latest), seconds)
+            if time.monotonic() - saved >= self.config.checkpoint_interval:
+                self._save(name, phase)
+                saved = time.monotonic()
+        self.progress.end(position.seconds.get(name, 0.0))
         return True
 
     def _log_unit(
@@ -229,6 +248,12 @@ class _Run:
                 "%s could not log unit %d: %s", type(logger).__name__, position.unit, error
             )
 
+    def _note_warnings(self, metadata: dict[str, Any]) -> None:
+        known = metadata.get("warnings", [])
+        if new := [text for text in self.warned.texts if text not in known]:
+            metadata["warnings"] = [*known, *new]
+            self.directory.write_metadata(metadata)
+
     def _finish(self, name: str, phase: Phase, metadata: dict[str, Any]) -> None:
         self._save(name, phase, self.directory.phase(name))
         clear_rotation(self.directory.rotation)
@@ -238,15 +263,16 @@ class _Run:
             metadata[name] = phase.summary
         self.directory.write_metadata(metadata)
 
-    def _save(self, name: str, phase: Phase, path: Path | None = None) -> None:
-        state = {
+    def _state(self, name: str, phase: Phase) -> dict[str, Any]:
+        return {
             "phase": name,
             "trainer": phase.state_dict(),
             "random": GlobalRNGState().state_dict(),
             "position": vars(self.position),
         }
-        place = path or self.directory.rotation
-        save_state(place, state, metadata=self.origin, step=self.position.unit)
+
+    def _save(self, name: str, phase: Phase, path: Path | None = None) -> None:
+        self.keeper.save(self._state(name, phase), self.position.unit, path)
 
     def _resume_phase(self, name: str, phase: Phase) -> None:
         """Continue from the newest checkpoint of this phase, if it has one."""
@@ -289,12 +315,3 @@ def _seed_everything(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
-
-
-def _summary(metrics: Mapping[str, float]) -> str:
-    """Format the returns among the metrics, or else the errors and losses."""
-    for words in (("return",), ("error", "loss")):
-        chosen = {k: v for k, v in metrics.items() if any(word in k for word in words)}
-        if chosen:
-            return ", ".join(f"{k} {v:.4g}" for k, v in list(chosen.items())[:2])
-    return ""

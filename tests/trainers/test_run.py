@@ -22,7 +22,8 @@ from .run_parts import CONFIG, EVALUATE, POLICY, UNITS, assert_equal, rows, with
 
 
 def test_a_run_leaves_what_it_promises(whole: Path) -> None:
-    names = {"config.yaml", "metadata.json", "metrics.csv", "evaluation.json", "episode.png"}
+    names = {"config.yaml", "metadata.json", "metrics.csv", "evaluation.json", "report.html"}
+    names |= {"episode.png", "episode.csv"}
     assert names | {"agent", "phases", "checkpoints"} == {p.name for p in whole.iterdir()}
     assert not list((whole / "checkpoints").iterdir())
     metadata = json.loads((whole / "metadata.json").read_text())
