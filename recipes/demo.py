@@ -2,8 +2,8 @@
 
     python recipes/demo.py            # or: make demo
 
-It learns as ``phihp train`` does with the default preset, nothing prepared beforehand, and puts a
-picture and a GIF into ``outputs/demo``. Words are settings: ``python recipes/demo.py seed=1``.
+It learns as ``phihp train`` does with the default preset, nothing prepared beforehand, and puts
+page and pictures into ``outputs/demo``. Words are settings: ``python recipes/demo.py seed=1``.
 """
 
 from __future__ import annotations
@@ -12,32 +12,44 @@ import shutil
 import sys
 from pathlib import Path
 
-from torchrl.checkpoint import CheckpointError
-
-from phihp_torchrl.commands import tell
-from phihp_torchrl.config import ConfigError, compose_yaml
-from phihp_torchrl.trainers import read_request, run
+from phihp_torchrl.display import loading
 
 TASK = "pendulum-swingup"
 OUTPUT = Path("outputs/demo")
+FIRST = (
+    f"{TASK}: from nothing, it takes real steps, fits a model to them, learns a policy in the "
+    "model,\nand plans with both. Loading PyTorch and TorchRL first, which takes some seconds."
+)
 
 
 def main(words: list[str]) -> None:
     """Learn PendulumSwingup and show it."""
-    words = [f"task={TASK}", *words]
-    print(f"{TASK}: a model from real steps, a policy from the model, planning with both.\n")
+    try:
+        with loading(FIRST):
+            learn([f"task={TASK}", *words])
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def learn(words: list[str]) -> None:
+    """Learn as the words say, and put the pictures where they are easily found."""
+    from torchrl.checkpoint import CheckpointError
+
+    from phihp_torchrl.commands import tell
+    from phihp_torchrl.config import ConfigError, compose_yaml
+    from phihp_torchrl.trainers import read_request, run
+
     try:
         request = read_request(compose_yaml(words), words)
         result = run(request.config, request.path, resume=request.resume)
     except (ConfigError, CheckpointError) as error:
         sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit(130)
-    tell(result)
     OUTPUT.mkdir(parents=True, exist_ok=True)
-    for source in sorted(result.path.glob("episode.*")):
-        shutil.copyfile(source, OUTPUT / source.name)
-        print(f"wrote {OUTPUT / source.name}")
+    tell(result)
+    for name in ("report.html", "episode.png", "episode.gif"):
+        if (result.path / name).is_file():
+            shutil.copyfile(result.path / name, OUTPUT / name)
+            print(f"wrote {OUTPUT / name}")
 
 
 if __name__ == "__main__":

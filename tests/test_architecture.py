@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "phihp_torchrl"
 FOLDERS = (
     "config",
+    "display",
     "integrators",
     "systems",
     "tasks",

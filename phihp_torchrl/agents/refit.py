@@ -31,6 +31,9 @@ from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Rollouts, finite_transition
 from phihp_torchrl.tasks import ActionBounds
 
+DOING = "fitting the critics to returns"
+"""What a run says that it is doing while this is on its stack."""
+
 # Half of the actions are near the actor's, where actor and planner compare values; the others come
 # from the replay buffer, so that the critics are accurate for other actions too.
 _OWN_SHARE = 0.5

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
+from phihp_torchrl.display import loading
+
 COMMANDS = {
     "train": "learn a model, a policy and a planner: phihp train task=acrobot",
     "evaluate": "play a trained agent: phihp evaluate agent=results/agents/acrobot",
@@ -15,6 +17,8 @@ COMMANDS = {
     "list": "print tasks, methods, presets, worlds and planners, a line each",
 }
 """Commands and what each does, in a line. Each is a module here, with a function ``main``."""
+_SILENT = {"-h", "--help", "-c", "--cfg", "-m", "--multirun", "progress=false"}
+"""Words with which there is nothing to load, or nothing to be said of one run."""
 
 
 def main(words: Sequence[str] | None = None, *, command: str | None = None, **options: Any) -> None:
@@ -42,7 +46,12 @@ def main(words: Sequence[str] | None = None, *, command: str | None = None, **op
     if command not in COMMANDS:
         known = list(COMMANDS)
         sys.exit(f"error: command: expected one of {known}, got {command!r}.\n\n{usage()}")
-    import_module(f"phihp_torchrl.commands.{command}").main(words, **options)
+    first = f"phihp {command}: loading PyTorch and TorchRL, which takes some seconds."
+    try:
+        with loading(first, enabled=command == "train" and not _SILENT & set(words)):
+            import_module(f"phihp_torchrl.commands.{command}").main(words, **options)
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 def usage() -> str:

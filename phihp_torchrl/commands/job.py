@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
+import logging
+import os
 import sys
 from collections.abc import Sequence
 
@@ -21,12 +24,17 @@ from phihp_torchrl.evaluation import controllers_table, returns_table
 from phihp_torchrl.trainers import (
     NonFiniteError,
     RunResult,
+    next_steps,
     read_controllers,
+    read_learned,
     read_request,
     read_result,
     resume_command,
     run,
 )
+
+_SHOWN = {"report.html": "the page to read", "episode.png": "the picture", "episode.gif": "moving"}
+"""Files that a run has for its reader, and what they are."""
 
 
 def launch(words: Sequence[str], settings: Sequence[str], config_dir: str | None) -> None:
@@ -62,14 +70,32 @@ def job(composed: DictConfig) -> None:
 
 
 def tell(result: RunResult) -> None:
-    """Print the table of returns, or how to resume a run that was stopped."""
+    """Print the table of returns, the picture and what to do next; or how to go on with the run."""
+    path = result.path
     if result.signal is not None and not result.finished:
-        command = resume_command(result.path)
-        print(f"\nStopped. Go on with: {command}")  # noqa: T201 (a console command)
+        print(f"\nStopped. Go on with: {resume_command(path)}")  # noqa: T201 (a console command)
+        # At its exit torch waits for the kernels that are being compiled, up to minutes. What is
+        # registered last comes first.
+        atexit.register(_leave, 128 + result.signal)
         sys.exit(128 + result.signal)
-    earned = read_result(result.path)
+    earned = read_result(path)
     if earned is not None:
         print(f"\n{returns_table([earned])}")  # noqa: T201
-    if (beside := read_controllers(result.path)) is not None:
+    if (beside := read_controllers(path)) is not None:
         print(f"{controllers_table('controller', beside)}")  # noqa: T201
-    print(f"Everything is in {result.path}")  # noqa: T201
+    if (learned := read_learned(path)) is not None:
+        print(learned)  # noqa: T201
+    print(f"Everything is in {path}")  # noqa: T201
+    for name, words in _SHOWN.items():
+        if (path / name).is_file():
+            print(f"  {words + ':':<19}{path / name}")  # noqa: T201
+    for what, command in next_steps(path):
+        print(f"To {what}:\n  {command}")  # noqa: T201
+
+
+def _leave(code: int) -> None:
+    """End the process without what others do at its exit."""
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)

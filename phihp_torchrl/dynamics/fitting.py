@@ -18,6 +18,9 @@ from phihp_torchrl.dynamics.members import member_loss
 from phihp_torchrl.dynamics.residual import ResidualMLP
 from phihp_torchrl.dynamics.shooting import multiple_shooting
 
+DOING = "fitting the model"
+"""What a run says that it is doing while this is on its stack."""
+
 
 @dataclass(frozen=True)
 class FitReport:

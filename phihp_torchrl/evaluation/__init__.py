@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from phihp_torchrl.evaluation.beside import BASELINES_KEY, controllers_table, play_baselines
 from phihp_torchrl.evaluation.episode import Episode, play_episode
-from phihp_torchrl.evaluation.figures import episode_figure
+from phihp_torchrl.evaluation.figures import Curve, episode_figure
 from phihp_torchrl.evaluation.latency import Latency, measure_latency
+from phihp_torchrl.evaluation.predicted import EVERY, Predictions, predict_episode
 from phihp_torchrl.evaluation.published import PUBLISHED, TARGETS, Published
 from phihp_torchrl.evaluation.returns import Evaluation, evaluate
 from phihp_torchrl.evaluation.seeds import (

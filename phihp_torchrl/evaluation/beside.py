@@ -15,6 +15,9 @@ from phihp_torchrl.evaluation.table import markdown_table
 from phihp_torchrl.evaluation.violations import is_violation
 from phihp_torchrl.worlds import World
 
+DOING = "playing controllers by hand"
+"""What a run says that it is doing while this is on its stack."""
+
 _log = logging.getLogger(__name__)
 
 BASELINES_KEY = "baselines"

@@ -13,6 +13,9 @@ from phihp_torchrl.config import ConfigError
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
 from phihp_torchrl.tasks import Task, find_task
 
+DOING = "timing actions"
+"""What a run says that it is doing while this is on its stack."""
+
 
 @dataclass(frozen=True)
 class Latency:

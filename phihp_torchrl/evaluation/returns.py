@@ -22,6 +22,8 @@ from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld, World
 
 _log = logging.getLogger(__name__)
+DOING = "playing episodes"
+"""What a run says that it is doing while this is on its stack."""
 
 
 @dataclass(frozen=True)

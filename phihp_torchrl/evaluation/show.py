@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import csv
 import logging
 from pathlib import Path
 
 from phihp_torchrl.deployment import Agent
-from phihp_torchrl.evaluation.episode import play_episode
-from phihp_torchrl.evaluation.figures import episode_figure
+from phihp_torchrl.evaluation.episode import Episode, play_episode
+from phihp_torchrl.evaluation.figures import Curve, episode_figure
+from phihp_torchrl.evaluation.predicted import Predictions, predict_episode
 from phihp_torchrl.evaluation.seeds import evaluation_seed
 from phihp_torchrl.evaluation.video import write_gif
 from phihp_torchrl.worlds import World
+
+DOING = "drawing an episode"
+"""What a run says that it is doing while this is on its stack."""
 
 _log = logging.getLogger(__name__)
 
@@ -23,8 +28,12 @@ def show_episode(
     name: str = "episode",
     video: bool = True,
     seed: int = 0,
+    curve: Curve | None = None,
 ) -> list[Path]:
     """Play one episode of an agent and write a figure ``<name>.png`` and a GIF ``<name>.gif``.
+
+    If the agent has a model, the figure shows what that predicts beside what happened. The numbers
+    of both are in a table ``<name>.csv``.
 
     If there are no pictures of the world (no pygame, or a system without pictures), a warning is
     logged and only the figure is written.
@@ -36,9 +45,10 @@ def show_episode(
         name: name of the files, without ending.
         video: whether to write the GIF.
         seed: number of the evaluation seed.
+        curve: returns over real steps for the figure: points by what earned them.
 
     Returns:
-        The files that were written.
+        The pictures that were written.
 
     Examples:
         >>> import tempfile
@@ -64,5 +74,27 @@ def show_episode(
             _log.warning("No GIF of the episode: %s", error)
     if episode is None:
         episode = play_episode(agent, agent.task, seed=evaluation_seed(seed), world=world)
-    episode_figure(episode).savefig(files[0], dpi=120)
+    predicted = None
+    if agent.dynamics is not None:
+        predicted = predict_episode(agent.dynamics, episode)
+    episode_figure(episode, predicted, curve).savefig(files[0], dpi=120)
+    _write_table(episode, predicted, directory / f"{name}.csv")
     return files
+
+
+def _write_table(episode: Episode, predicted: Predictions | None, path: Path) -> None:
+    """Write an episode as a table, a row for each state; numbers that there are not are empty."""
+    system, task = episode.task.system, episode.task
+    with path.open("w", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        foreseen = [f"predicted {name}" for name in system.state_names] if predicted else []
+        table.writerow(["time", *system.state_names, *system.action_names, "reward", *foreseen])
+        for i, state in enumerate(episode.states):
+            row = [i * task.time_step, *state[: system.state_dim]]
+            last = i == len(episode.actions)
+            none = [""] * (len(system.action_names) + 1)
+            row += none if last else [*episode.actions[i], episode.rewards[i]]
+            if predicted is not None:
+                none = [""] * system.state_dim
+                row += [*predicted.states[i - 1, : system.state_dim]] if i else none
+            table.writerow([v if isinstance(v, str) else f"{v:.7g}" for v in row])

@@ -6,9 +6,9 @@ import statistics
 from collections.abc import Sequence
 from html import escape
 
+from phihp_torchrl.display import Numbers, Series, chart, figure, thin
 from phihp_torchrl.identification.parts import Residuals, Rollout
 from phihp_torchrl.identification.result import Identification
-from phihp_torchrl.identification.svg import Numbers, Series, chart, thin
 
 _DOTS = 350
 _BINS = 10
@@ -38,12 +38,12 @@ def _rollout(found: Identification, number: int, rollout: Rollout) -> str:
             Series(time, rollout.predicted[name], "line", "model"),
         ]
         label = with_unit(found, name)
-        figures.append(_figure(chart(lines, alt, "time (s)", label, shade_from=0.0)))
+        figures.append(figure(chart(lines, alt, "time (s)", label, shade_from=0.0)))
     for name, command in rollout.action.items():
         line = Series(time, command, "steps", "command")
         alt = f"The command {name} over time."
         label = with_unit(found, name)
-        figures.append(_figure(chart([line], alt, "time (s)", label, shade_from=0.0)))
+        figures.append(figure(chart([line], alt, "time (s)", label, shade_from=0.0)))
     where = ", which meets a stop" if rollout.at_stop else ""
     title = f"{number}. {escape(rollout.source)}, episode {rollout.episode}, from {origin:.4g} s"
     return f'<h3>{title}{where}</h3>\n<div class="charts">{"".join(figures)}</div>\n'
@@ -76,7 +76,7 @@ def _of_state(found: Identification, left: Residuals, name: str) -> str:
             alt = f"Residuals of {name} against {other}. {_trend(lines[1].y, noise)}"
             x_label = other if kind == "command before" else with_unit(found, other)
             svg = chart(lines, alt, x_label, label, band=noise, y_range=(-reach, reach))
-            figures.append(_figure(svg, f"against the {kind} {other}" if kind != "command before"
+            figures.append(figure(svg, f"against the {kind} {other}" if kind != "command before"
                                    else f"against {other}"))  # fmt: skip
     white = left.autocorrelation.get(name)
     if white:
@@ -121,12 +121,7 @@ def _whiteness(name: str, white: Sequence[float]) -> str:
         f"{', '.join(f'{v:.2f}' for v in white)}."
     )
     svg = chart(bars, alt, "samples apart", "correlation", y_range=(-1.0, 1.0))
-    return _figure(svg, "against those before: white noise has no correlation")
-
-
-def _figure(svg: str, caption: str = "") -> str:
-    below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f"<figure>{svg}{below}</figure>\n"
+    return figure(svg, "against those before: white noise has no correlation")
 
 
 def with_unit(found: Identification, name: str) -> str:

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from html import escape
-from typing import Any
 
+from phihp_torchrl.display import cautions, facts, html_page, said
 from phihp_torchrl.identification import sections
 from phihp_torchrl.identification.charts import residual_charts, rollout_charts
 from phihp_torchrl.identification.parts import FIXED, IDENTIFIED
 from phihp_torchrl.identification.result import Identification
-from phihp_torchrl.identification.style import STYLE
-
-_POLICY = "default-src 'none'; style-src 'unsafe-inline'"
-"""What the page may load: nothing; a browser holds it to that."""
 
 _ABOUT_CONSTANTS = (
     "The ring is the first guess, the dot the estimate, and the bar the 95 % interval, each row on "
@@ -85,32 +81,15 @@ def report_page(
         "constants": ("Constants", _constants(found)),
         "actuator": ("Actuator", _actuator(found)),
         "errors": ("Errors of predictions", _errors(found)),
-        "rollouts": ("Predicted and measured", _said(_ABOUT_ROLLOUTS, rollout_charts(found))),
-        "residuals": ("Residuals", _said(_ABOUT_RESIDUALS, residual_charts(found))),
+        "rollouts": ("Predicted and measured", said(_ABOUT_ROLLOUTS, rollout_charts(found))),
+        "residuals": ("Residuals", said(_ABOUT_RESIDUALS, residual_charts(found))),
         "noise": ("Noise", sections.noise(found)),
         "use": ("To use it", _lines(lines or {})),
     }
-    kept = {key: (head, html) for key, (head, html) in parts.items() if html}
-    links = "".join(f'<li><a href="#{key}">{head}</a></li>' for key, (head, _) in kept.items())
-    body = "".join(
-        f'<section id="{key}" aria-labelledby="{key}-head">\n<h2 id="{key}-head">{head}</h2>\n'
-        f"{html}</section>\n"
-        for key, (head, html) in kept.items()
-    )
-    name = escape(title)
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        f"<title>{name}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<header>\n"
-        f"<h1>{name}</h1>\n{_tiles(found)}"
-        f'<nav aria-label="Sections"><ul>{links}</ul></nav>\n</header>\n'
-        f"<main>\n{body}</main>\n</body>\n</html>\n"
-    )
+    return html_page(title, _tiles(found), parts)
 
 
-def _tiles(found: Identification) -> str:
+def _tiles(found: Identification) -> list[tuple[str, str]]:
     """The page in four numbers."""
     judged = [c for c in found.constants.values() if c.verdict != FIXED]
     told = sum(c.verdict == IDENTIFIED for c in judged)
@@ -133,52 +112,22 @@ def _tiles(found: Identification) -> str:
         tiles.append((f"{ratio} × noise", f"error {steps} steps ahead"))
     count = len(found.warnings)
     tiles.append((str(count) if count else "none", "warning" if count == 1 else "warnings"))
-    items = "".join(f"<li><b>{escape(big)}</b>{escape(small)}</li>" for big, small in tiles)
-    return f'<ul class="tiles">{items}</ul>\n'
+    return tiles
 
 
 def _warnings(found: Identification) -> str:
     if not found.warnings:
         return "<p>None: nothing speaks against these numbers.</p>\n"
-    texts: dict[str, list[str]] = {}  # some warnings have one advice
-    for warning in found.warnings:
-        texts.setdefault(warning.advice, []).append(warning.text)
-    return "".join(
-        '<div class="warning">'
-        + "".join(f"<p><strong>▲ {escape(text)}</strong></p>" for text in of)
-        + f"<p>What to do: {escape(advice)}</p></div>\n"
-        for advice, of in texts.items()
-    )
+    return cautions((warning.text, warning.advice) for warning in found.warnings)
 
 
 def _data(found: Identification) -> str:
     elsewhere = ("noise_without_model", "notes")
-    facts = {k: v for k, v in found.data.items() if k not in elsewhere}
+    read = {k: v for k, v in found.data.items() if k not in elsewhere}
     settings = {**found.settings, "stops": found.stops, "seconds of the fit": found.seconds}
     items = "".join(f"<li>{escape(note)}</li>" for note in found.data.get("notes", ()))
     told = f"<h3>What was left out, and why</h3>\n<ul>{items}</ul>\n" if items else ""
-    return f"{_facts(facts)}{told}<h3>How it was fitted</h3>\n{_facts(settings)}"
-
-
-def _facts(facts: Mapping[str, Any]) -> str:
-    rows = "".join(
-        f"<dt>{escape(_name(key))}</dt><dd>{escape(_fact(value))}</dd>"
-        for key, value in facts.items()
-    )
-    return f'<dl class="facts">{rows}</dl>\n'
-
-
-def _name(key: str) -> str:
-    return key.replace("_", " ").removesuffix(" s") + (" (s)" if key.endswith("_s") else "")
-
-
-def _fact(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{k}: {_fact(v)}" for k, v in value.items()) or "none"
-    if isinstance(value, (list, tuple)):
-        return " to ".join(_fact(v) for v in value) if len(value) == 2 else ", ".join(
-            _fact(v) for v in value)  # fmt: skip
-    return sections.number(value, 5) if isinstance(value, float) else str(value)
+    return f"{facts(read)}{told}<h3>How it was fitted</h3>\n{facts(settings)}"
 
 
 def _constants(found: Identification) -> str:
@@ -189,13 +138,13 @@ def _constants(found: Identification) -> str:
     if found.restitution:
         caption = "Share of the speed that is left at the stops of a position"
         html += sections.estimates(found, found.restitution, caption)
-    return _said(_ABOUT_CONSTANTS, html)
+    return said(_ABOUT_CONSTANTS, html)
 
 
 def _actuator(found: Identification) -> str:
     tried = sections.tried_paths(found)
     more = f"<h3>What was tried</h3>\n{tried}" if tried else ""
-    return _said(_ABOUT_ACTUATOR, sections.actuator_parts(found) + more)
+    return said(_ABOUT_ACTUATOR, sections.actuator_parts(found) + more)
 
 
 def _errors(found: Identification) -> str:
@@ -203,7 +152,7 @@ def _errors(found: Identification) -> str:
         return "<p>No stretch was long enough to be held out, so nothing was predicted.</p>\n"
     where = sections.regions(found)
     more = f"<h3>By regions</h3>\n<p>{_ABOUT_REGIONS}</p>\n{where}" if where else ""
-    return _said(_ABOUT_ERRORS, sections.horizons(found) + more)
+    return said(_ABOUT_ERRORS, sections.horizons(found) + more)
 
 
 def _lines(lines: Mapping[str, str]) -> str:
@@ -211,8 +160,3 @@ def _lines(lines: Mapping[str, str]) -> str:
         f'<h3>{escape(place)}</h3>\n<pre tabindex="0">{escape(text)}</pre>\n'
         for place, text in lines.items()
     )
-
-
-def _said(about: str, html: str) -> str:
-    """A section with a sentence before it; nothing where it has no content."""
-    return f"<p>{about}</p>\n{html}" if html else ""

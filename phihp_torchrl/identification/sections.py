@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
-from typing import Any, NamedTuple
+from typing import Any
 
+from phihp_torchrl.display import Cell, interval_bar, number, table
 from phihp_torchrl.identification.charts import with_unit
 from phihp_torchrl.identification.parts import (
     AT_LIMIT,
@@ -19,7 +20,6 @@ from phihp_torchrl.identification.parts import (
     StateError,
 )
 from phihp_torchrl.identification.result import Identification
-from phihp_torchrl.identification.svg import interval_bar
 from phihp_torchrl.tasks import Numbers
 
 _LARGE = 2.0
@@ -33,62 +33,6 @@ PARTS = {
     "gain_low": ("gain of negative commands", "", 1.0),
 }
 """Parts of an actuator: what each is, its unit, and its number where there is none."""
-
-
-class Cell(NamedTuple):
-    """A cell of a table: HTML, its class, and whether it is the row's header."""
-
-    html: str
-    css: str = ""
-    head: bool = False
-
-
-def number(value: float | None, digits: int = 4) -> str:
-    """A number for readers; a dash for none.
-
-    Examples:
-        >>> number(0.123456), number(None), number(12345.6), number(1234567.0)
-        ('0.1235', '–', '12346', '1.235e+06')
-    """
-    if value is None or value != value:
-        return "–"
-    return f"{value:.0f}" if 10.0**digits <= abs(value) < 1e6 else f"{value:.{digits}g}"
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[Cell]], caption: str, css: str = "") -> str:
-    """A table with header cells, which a narrow screen can scroll, or stack with class ``stack``.
-
-    Args:
-        head: texts of the header.
-        rows: cells of each row.
-        caption: what it shows, for those who do not see it.
-        css: its class.
-    """
-    body, numeric = [], [False] * len(head)
-    for row in rows:
-        cells = []
-        for i, (label, cell) in enumerate(zip(head, row, strict=True)):
-            numeric[i] |= "number" in cell.css
-            css_of = f' class="{cell.css}{"" if cell.html else " empty"}"'
-            if cell.head:
-                cells.append(f'<th scope="row" role="rowheader"{css_of}>{cell.html}</th>')
-            else:
-                label = escape(label)
-                content = f"<span>{cell.html}</span>"
-                cells.append(f'<td role="cell" data-label="{label}"{css_of}>{content}</td>')
-        kept = ' class="kept"' if any("kept" in cell.css for cell in row) else ""
-        body.append(f'<tr role="row"{kept}>{"".join(cells)}</tr>')
-    heads = "".join(
-        f'<th scope="col" role="columnheader"{" class=number" if n else ""}>{escape(h)}</th>'
-        for h, n in zip(head, numeric, strict=True)
-    )
-    label = escape(caption)
-    return (
-        f'<div class="scroll" role="region" tabindex="0" aria-label="{label}">'
-        f'<table role="table" class="{css}" aria-label="{label}">'
-        f'<thead role="rowgroup"><tr role="row">{heads}</tr></thead>\n'
-        f'<tbody role="rowgroup">{chr(10).join(body)}</tbody></table></div>\n'
-    )
 
 
 def estimates(found: Identification, of: Mapping[str, Estimate], caption: str) -> str:

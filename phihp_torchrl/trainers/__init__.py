@@ -23,6 +23,7 @@ from phihp_torchrl.trainers.loggers import LoggerConfig, RunLogger, make_logger
 from phihp_torchrl.trainers.metrics_table import read_rows
 from phihp_torchrl.trainers.model import ModelTrainer
 from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
+from phihp_torchrl.trainers.next_steps import next_steps, resume_command
 from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_phase
 from phihp_torchrl.trainers.plugins import import_plugins
 from phihp_torchrl.trainers.policy import PolicyTrainer
@@ -30,8 +31,7 @@ from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.policy_phase import build_policy
 from phihp_torchrl.trainers.policy_search import PolicySearch
 from phihp_torchrl.trainers.record import record
-from phihp_torchrl.trainers.results import read_controllers, read_result
-from phihp_torchrl.trainers.resume_command import resume_command
+from phihp_torchrl.trainers.results import read_controllers, read_learned, read_result
 from phihp_torchrl.trainers.run import RunResult, run
 from phihp_torchrl.trainers.run_checks import check_run
 from phihp_torchrl.trainers.run_config import RunConfig, task_of

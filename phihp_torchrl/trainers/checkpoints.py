@@ -7,7 +7,7 @@ import logging
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors.torch import load as load_tensors
@@ -69,23 +69,53 @@ class SafeStateAdapter(CheckpointAdapter):
         component.load_state_dict(_decode(record["tree"], load_tensors(data)))
 
 
+class Frozen(NamedTuple):
+    """A state as it was at a moment: nothing that happens to its tensors later changes it.
+
+    Attributes:
+        tree: the state as JSON, in which tensors have names.
+        tensors: copies of the tensors on the CPU, by name.
+    """
+
+    tree: Any
+    tensors: dict[str, Tensor]
+
+
+def freeze(state: Mapping[str, Any]) -> Frozen:
+    """Copy a state, to be saved later or never.
+
+    Args:
+        state: as of :func:`save_state`.
+
+    Examples:
+        >>> weight = torch.zeros(1)
+        >>> frozen = freeze({"weight": weight})
+        >>> weight += 1
+        >>> frozen.tensors
+        {'0': tensor([0.])}
+    """
+    tensors: dict[str, Tensor] = {}
+    return Frozen(_encode(state, tensors), tensors)
+
+
 class State:
     """Holds a state while a checkpoint is written or read.
 
     Args:
-        state: the state to write.
+        state: the state to write, or a frozen one.
         digest: the digest that the JSON file to read must have; ``None`` for any.
     """
 
-    def __init__(self, state: Mapping[str, Any] | None = None, digest: str | None = None) -> None:
-        self.state = state or {}
-        tensors: dict[str, Tensor] = {}
-        tree = _encode(self.state, tensors)
+    def __init__(
+        self, state: Mapping[str, Any] | Frozen | None = None, digest: str | None = None
+    ) -> None:
+        self.state: Any = {}
+        tree, tensors = state if isinstance(state, Frozen) else freeze(state or {})
         self.data = save_tensors(tensors)
         self.tree = json.dumps({"tensors": digest_of(self.data), "tree": tree})
         self.digest = digest
 
-    def state_dict(self) -> Mapping[str, Any]:
+    def state_dict(self) -> Any:
         return self.state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -94,7 +124,7 @@ class State:
 
 def save_state(
     directory: CheckpointRotation | Path,
-    state: Mapping[str, Any],
+    state: Mapping[str, Any] | Frozen,
     *,
     metadata: Mapping[str, Any],
     step: int = 0,
@@ -103,7 +133,8 @@ def save_state(
 
     Args:
         directory: the rotation, or the path of a single checkpoint.
-        state: nested dictionaries, lists and tuples of tensors, tensordicts, numbers and texts.
+        state: nested dictionaries, lists and tuples of tensors, tensordicts, numbers and texts; or
+            such a state as :func:`freeze` has copied it.
         metadata: description of the state; :func:`load_state` requires an equal one.
         step: position in the rotation.
     """

@@ -26,6 +26,7 @@ from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.files import write_atomically
 from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
+from phihp_torchrl.trainers.return_curve import read_rows, return_curve
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.worlds import GuardedWorld, World, crossings_text
@@ -247,7 +248,8 @@ class EvaluatePhase:
 
     def _show(self) -> None:
         video, place = self.settings.video, self.directory.path
-        for path in show_episode(self.agent, place, world=self.world, video=video):
+        curve = return_curve(read_rows(self.directory.metrics))
+        for path in show_episode(self.agent, place, world=self.world, video=video, curve=curve):
             self.new_files.append(NewFile(f"evaluate/{path.stem}{path.suffix}", path))
 
 

@@ -12,6 +12,9 @@ from phihp_torchrl.imagination import Worlds
 from phihp_torchrl.trainers.learners import Imagination, register_learner
 from phihp_torchrl.trainers.replay_base import ReplayTrainer
 
+DOING = "training in imagination"
+"""What a run says that it is doing while this is on its stack."""
+
 _log = logging.getLogger(__name__)
 
 # Where more steps than this had to be limited, gradients are no guide any more.

@@ -11,6 +11,9 @@ from torch import Tensor
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
 
+DOING = "playing in imagination"
+"""What a run says that it is doing while this is on its stack."""
+
 
 class Played(NamedTuple):
     """A stretch of episodes.

@@ -8,6 +8,9 @@ from phihp_torchrl.agents import learning_rate_scale
 from phihp_torchrl.trainers.learners import Imagination, register_learner
 from phihp_torchrl.trainers.td3_base import TD3Trainer
 
+DOING = "training in imagination"
+"""What a run says that it is doing while this is on its stack."""
+
 
 class ImaginedTD3(TD3Trainer):
     """Steps imagined worlds into a replay, and learns from it by TD3.

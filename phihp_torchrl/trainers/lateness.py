@@ -23,6 +23,9 @@ from phihp_torchrl.recordings import transitions
 from phihp_torchrl.tasks import Actuator, Task
 from phihp_torchrl.worlds import World
 
+DOING = "looking for a delay of commands"
+"""What a run says that it is doing while this is on its stack."""
+
 _log = logging.getLogger(__name__)
 
 AUTO, NONE = "auto", "none"

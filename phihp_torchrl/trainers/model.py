@@ -33,7 +33,7 @@ from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
 from phihp_torchrl.trainers.model_doubts import Doubts
 from phihp_torchrl.trainers.model_fit import chooses_solver, fit_choosing, measures, solver_number
 from phihp_torchrl.trainers.phases import Phase, register_phase
-from phihp_torchrl.trainers.real_data import RealData, Taken, replay_batch
+from phihp_torchrl.trainers.real_data import RealData, Taken, collected_return, replay_batch
 from phihp_torchrl.worlds import make_world
 
 
@@ -163,6 +163,8 @@ class ModelTrainer:
             self._doubts.of_task(self.task, self.data, self.real_steps, last=self._has_all)
         reward = self.data["next", "reward"][-self._new :].mean()
         metrics = {"real_steps": self.real_steps, "collect/reward": reward}
+        if self.source.recorded is None:
+            metrics["collect/return"] = collected_return(self.task, self.data[-self._new :])
         if self.config.collect.exploration.guards:
             metrics["collect/guard_crossings"] = self.crossings.total()
         if self._dropped:

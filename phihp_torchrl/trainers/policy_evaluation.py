@@ -13,6 +13,9 @@ from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.worlds import World
 
+DOING = "playing the actor"
+"""What a run says that it is doing while this is on its stack."""
+
 
 class ActorEvaluation:
     """Plays the noise-free actor from the task's resets, in the model and in a simulated world.

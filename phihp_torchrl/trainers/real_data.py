@@ -18,6 +18,9 @@ from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.collect import Policy, drop_unusable, steady, within_rate
 from phihp_torchrl.worlds import World, check_env, command_memory, crossings_text, guard_env
 
+DOING = "taking real steps"
+"""What a run says that it is doing while this is on its stack."""
+
 _log = logging.getLogger(__name__)
 
 _SAME_STEP = 1e-3
@@ -171,6 +174,25 @@ def replay_batch(task: Task, data: TensorDict | None) -> Batch:
     reward, price = data["next", "reward"][:, 0], task.price(state, action, next_state)
     reward = reward if price is None else reward - price
     return Batch(state, action, reward, next_state, terminated)
+
+
+def collected_return(task: Task, data: TensorDict) -> float:
+    """The return of an episode as the real steps of a collection were taken.
+
+    Where episodes were terminated, it is the mean return of those that are over. Where none was, it
+    is the mean reward times the steps of an episode, for a collection may be shorter than one.
+
+    Args:
+        task: the task.
+        data: transitions ``[N]`` in order; the last one is ``"done"`` in any case.
+    """
+    reward, following = data["next", "reward"].flatten(), data["next"]
+    if not following["terminated"].any():
+        return reward.mean().item() * task.max_steps
+    done = following["done"].flatten().clone()
+    done[-1] = following["terminated"].flatten()[-1]
+    ends = done.nonzero().flatten()
+    return reward.cumsum(0)[ends[-1]].item() / len(ends)
 
 
 def _recorded(world: World) -> TensorDict | None:

@@ -8,6 +8,7 @@ from typing import Any
 
 from phihp_torchrl.config import METHODS
 from phihp_torchrl.evaluation import BASELINES_KEY, TaskResult
+from phihp_torchrl.trainers.return_curve import read_rows
 from phihp_torchrl.trainers.run_directory import RunDirectory
 
 
@@ -36,6 +37,24 @@ def read_result(path: Path) -> TaskResult | None:
     # Targets and published returns are for simulated worlds only.
     task = config["task"] if world == "simulated" else f"{config['task']} in {world}"
     return TaskResult(task, samples, label=label, **means)
+
+
+def read_learned(path: Path) -> str | None:
+    """A sentence on the model of the run in ``path``: its constants, and its error; or ``None``.
+
+    Args:
+        path: directory of the run.
+    """
+    last: dict[str, str] = {}
+    for row in read_rows(RunDirectory(path).metrics):
+        last |= {name: value for name, value in row.items() if value}
+    start = "constants/"
+    names = [name.removeprefix(start) for name in last if name.startswith(start)]
+    parts = [", ".join(f"{name} {float(last[start + name]):.4g}" for name in names)]
+    if (error := last.get("model/rollout_error_20")) is not None:
+        parts.append(f"an error of {float(error):.2g} after 20 steps that it was not fitted to")
+    told = "; ".join(part for part in parts if part)
+    return f"The model has learned {told}." if names else None
 
 
 def read_controllers(path: Path) -> dict[str, dict[str, Any]] | None:

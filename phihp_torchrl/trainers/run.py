@@ -14,30 +14,30 @@ from typing import Any
 import numpy as np
 import torch
 from torchrl.checkpoint import CheckpointError, GlobalRNGState
-from tqdm.auto import tqdm
 
 from phihp_torchrl.config import ConfigError, resolve_seconds
+from phihp_torchrl.display import Progress
 from phihp_torchrl.origin import describe_origin
-from phihp_torchrl.trainers.checkpoints import (
-    clear_rotation,
-    load_latest,
-    load_state,
-    save_state,
-)
+from phihp_torchrl.trainers.checkpoints import clear_rotation, load_latest, load_state
 from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.expected import expect
 from phihp_torchrl.trainers.files import check_contained
 from phihp_torchrl.trainers.finite import check_finite
-from phihp_torchrl.trainers.interrupt import Interrupt
+from phihp_torchrl.trainers.headline import headline
+from phihp_torchrl.trainers.interrupt import Abandoned, Interrupt
+from phihp_torchrl.trainers.keeper import Keeper
 from phihp_torchrl.trainers.lock import RunLock
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
 from phihp_torchrl.trainers.metrics_table import MetricsTable
 from phihp_torchrl.trainers.phases import PHASES, Phase, real_steps
 from phihp_torchrl.trainers.rehearsal import rehearse
+from phihp_torchrl.trainers.report import report_run
 from phihp_torchrl.trainers.run_checks import check_run
 from phihp_torchrl.trainers.run_config import RunConfig, task_of
 from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.trainers.run_record import RunRecord
 from phihp_torchrl.trainers.start import begin, check_same, new_directory
+from phihp_torchrl.trainers.warned import Warned
 from phihp_torchrl.worlds import World, make_world
 
 _log = logging.getLogger(__name__)
@@ -128,23 +128,39 @@ def run(
     else:
         rehearse(config, world)
         config, directory = new_directory(config, path)
-    with RunLock(directory.path), Interrupt() as interrupt:
+    with RunLock(directory.path):
         if not resume:
             begin(config, directory)
-        return _Run(config, world, directory, interrupt).run()
+        expected = expect(config, directory.path)
+        progress = Progress(expected.middle, enabled=config.progress)
+        with Interrupt() as interrupt, progress, Warned() as warned:
+            progress.say(f"{config.task}, {config.label}, in {directory.path}. {expected.words()}")
+            result = _Run(config, world, directory, interrupt, progress, warned).run()
+        if result.finished:
+            report_run(directory, world)
+    return result
 
 
 class _Run:
     """The loop over phases, and over the units of each."""
 
     def __init__(
-        self, config: RunConfig, world: World, directory: RunDirectory, interrupt: Interrupt
+        self,
+        config: RunConfig,
+        world: World,
+        directory: RunDirectory,
+        interrupt: Interrupt,
+        progress: Progress,
+        warned: Warned,
     ) -> None:
         self.config = config
         self.world = world
         self.directory = directory
         self.interrupt = interrupt
+        self.progress = progress
+        self.warned = warned
         self.origin = {"task": config.task}
+        self.keeper = Keeper(directory.rotation, self.origin, interrupt)
         self.phases: dict[str, Phase] = {}
         self.position = _Position(0, 0, {})
         self.latest: dict[str, float] = {}
@@ -155,11 +171,13 @@ class _Run:
         try:
             for name in (*self.config.phases_before, *self.config.phases_to_do):
                 _seed_everything(self.config.seed)
-                phase = self._make_phase(name)
+                with self.interrupt.work():
+                    phase = self._make_phase(name)
                 self.phases[name] = phase
                 if self.directory.phase(name).exists():
                     state = load_state(self.directory.phase(name), metadata=self.origin)
                     self._restore(phase, state, ours=name in self.config.phases_to_do)
+                    self.progress.restored(name, self.position.seconds.get(name, 0.0))
                     continue
                 self._resume_phase(name, phase)
                 if table is None:
@@ -170,9 +188,13 @@ class _Run:
                 if not finished:
                     break
                 self._finish(name, phase)
+        except Abandoned:
+            finished = False
+            self.keeper.save_frozen()
         finally:
+            self._note_warnings()
             logger.close()
-        if table is None:  # everything was done before
+        if table is None and finished:  # everything was done before
             self.record.complete(self.phases, self.position.unit)
         return RunResult(self.directory.path, finished, self.interrupt.signal, self.latest)
 
@@ -194,34 +216,28 @@ class _Run:
     def _advance(self, name: str, phase: Phase, table: MetricsTable, logger: RunLogger) -> bool:
         """Work through a phase; false if a signal ended it early."""
         position, saved = self.position, time.monotonic()
-        done, total = phase.progress
-        hidden = None if self.config.progress else True  # None: shown on a terminal alone
-        with tqdm(
-            desc=name, initial=done, total=total, unit=f" {PHASES[name].unit}", disable=hidden
-        ) as bar:
-            while not phase.done:
-                if self.interrupt:
-                    self._save(name, phase)
-                    return False
-                start = time.monotonic()
+        self.progress.begin(name, phase.progress, PHASES[name].unit)
+        while not phase.done:
+            if self.interrupt:
+                self._save(name, phase)
+                return False
+            self.keeper.freeze(partial(self._state, name, phase), position.unit)
+            start = time.monotonic()
+            with self.interrupt.work():
                 metrics = phase.advance()
-                check_finite(
-                    phase,
-                    metrics,
-                    name=name,
-                    unit=PHASES[name].unit,
-                    directory=self.directory.path,
-                )
-                position.seconds[name] = position.seconds.get(name, 0.0) + time.monotonic() - start
-                position.real_steps = real_steps(self.phases)
-                self._log_unit(name, metrics, table, logger)
-                position.unit += 1
-                bar.total = phase.progress[1]
-                bar.update(phase.progress[0] - bar.n)
-                bar.set_postfix_str(_summary(metrics))
-                if time.monotonic() - saved >= self.config.checkpoint_interval:
-                    self._save(name, phase)
-                    saved = time.monotonic()
+            check_finite(
+                phase, metrics, name=name, unit=PHASES[name].unit, directory=self.directory.path
+            )
+            seconds = position.seconds.get(name, 0.0) + time.monotonic() - start
+            position.seconds[name] = seconds
+            position.real_steps = real_steps(self.phases)
+            self._log_unit(name, metrics, table, logger)
+            position.unit += 1
+            self.progress.advance(phase.progress, headline(self.latest), seconds)
+            if time.monotonic() - saved >= self.config.checkpoint_interval:
+                self._save(name, phase)
+                saved = time.monotonic()
+        self.progress.end(position.seconds.get(name, 0.0))
         return True
 
     def _log_unit(
@@ -249,6 +265,12 @@ class _Run:
                 "%s could not log unit %d: %s", type(logger).__name__, position.unit, error
             )
 
+    def _note_warnings(self) -> None:
+        known = self.record.metadata.get("warnings", [])
+        if new := [text for text in self.warned.texts if text not in known]:
+            self.record.metadata["warnings"] = [*known, *new]
+            self.record.write()
+
     def _finish(self, name: str, phase: Phase) -> None:
         self._save(name, phase, self.directory.phase(name))
         clear_rotation(self.directory.rotation)
@@ -259,16 +281,17 @@ class _Run:
         position = self.position
         self.record.note(name, phase, seconds=position.seconds, steps=position.real_steps)
 
-    def _save(self, name: str, phase: Phase, path: Path | None = None) -> None:
-        state = {
+    def _state(self, name: str, phase: Phase) -> dict[str, Any]:
+        return {
             "phase": name,
             "trainer": phase.state_dict(),
             "random": GlobalRNGState().state_dict(),
             "position": vars(self.position),
             **self.record.state_dict(),
         }
-        place = path or self.directory.rotation
-        save_state(place, state, metadata=self.origin, step=self.position.unit)
+
+    def _save(self, name: str, phase: Phase, path: Path | None = None) -> None:
+        self.keeper.save(self._state(name, phase), self.position.unit, path)
 
     def _resume_phase(self, name: str, phase: Phase) -> None:
         """Continue from the newest checkpoint of this phase, if it has one."""
@@ -317,12 +340,3 @@ def _seed_everything(seed: int) -> None:
     random.seed(seed)
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)
-
-
-def _summary(metrics: Mapping[str, float]) -> str:
-    """Format the returns among the metrics, or else the errors and losses."""
-    for words in (("return",), ("error", "loss")):
-        chosen = {k: v for k, v in metrics.items() if any(word in k for word in words)}
-        if chosen:
-            return ", ".join(f"{k} {v:.4g}" for k, v in list(chosen.items())[:2])
-    return ""

@@ -53,7 +53,7 @@ class RunConfig:
         threads: intra-op threads of torch; more than one is slower on these small networks.
         compile: whether to compile TD3, imagination and the agent's plans (minutes the first time,
             seconds later).
-        progress: whether to show progress bars on a terminal.
+        progress: whether to say at least every ten seconds where the run is.
         actuator: numbers of the task's actuator that differ, by name: delay_steps, lag, slew,
             dead_zone, gain_low.
         action_rate_limit: largest rate of each action in its units per second, one number or one

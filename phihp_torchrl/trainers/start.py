@@ -12,7 +12,7 @@ from phihp_torchrl.config import ConfigError, differences, digest_of_values, get
 from phihp_torchrl.trainers.checkpoints import load_state
 from phihp_torchrl.trainers.files import STAGE, check_contained, remove_stages
 from phihp_torchrl.trainers.lock import LOCK, OWNER
-from phihp_torchrl.trainers.resume_command import resume_command
+from phihp_torchrl.trainers.next_steps import resume_command
 from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig, is_enabled
 from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
 from phihp_torchrl.trainers.run_request import read_run_config

@@ -122,8 +122,11 @@ def test_the_demo_trains_and_shows(
     recipe: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recipe("demo", *SMALL)
-    assert "| pendulum-swingup | 1 | 60 |" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "| pendulum-swingup | 1 | 60 |" in out
+    assert "The model has learned gravity_gain" in out
     assert {p.name for p in (tmp_path / "outputs" / "demo").iterdir()} == {
+        "report.html",
         "episode.png",
         "episode.gif",
     }

@@ -128,7 +128,7 @@ def test_where_nothing_is_drawn_a_figure_is_left_and_a_warning(tmp_path, caplog)
     with caplog.at_level(logging.WARNING, logger="phihp_torchrl"):
         files = show_episode(agent, tmp_path, world=world)
     assert [file.name for file in files] == ["episode.png"]
-    assert [path.name for path in tmp_path.iterdir()] == ["episode.png"]
+    assert {path.name for path in tmp_path.iterdir()} == {"episode.png", "episode.csv"}
     assert "No GIF of the episode: render: expected a world that draws" in caplog.text
 
 

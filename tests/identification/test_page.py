@@ -6,10 +6,11 @@ import math
 import re
 from dataclasses import replace
 from html import unescape
-from html.parser import HTMLParser
 
 import pytest
+from pages import read
 
+from phihp_torchrl.display import Series, chart, interval_bar, thin
 from phihp_torchrl.identification import (
     ActuatorEstimate,
     ActuatorTrial,
@@ -24,47 +25,10 @@ from phihp_torchrl.identification import (
     ready_to_paste,
     report_page,
 )
-from phihp_torchrl.identification.svg import Series, chart, interval_bar, thin
 from phihp_torchrl.systems import Constant, System
 from phihp_torchrl.tasks import Actuator, Box, Task
 
 EVIL = '<script>alert("x")</script>&\''
-VOID = {"meta", "br", "link", "img", "input", "hr"}
-
-
-class Reader(HTMLParser):
-    """Checks that elements are nested, and collects what a page consists of."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.tags: list[tuple[str, dict[str, str | None]]] = []
-        self.text: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        assert len({name for name, _ in attrs}) == len(attrs), f"twice the same in {tag}: {attrs}"
-        self.tags.append((tag, dict(attrs)))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, dict(attrs)))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open, f"</{tag}> was never opened"
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if not self.open or self.open[-1] != "style":
-            self.text.append(data)
-
-
-def read(page: str) -> Reader:
-    reader = Reader()
-    reader.feed(page)
-    reader.close()
-    assert reader.open == []
-    return reader
 
 
 def sample(name: str = "angle", action: str = "volts", source: str = "a.csv") -> Identification:

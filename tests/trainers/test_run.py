@@ -21,8 +21,9 @@ from .run_parts import CONFIG, EVALUATE, POLICY, UNITS, assert_equal, rows, with
 
 
 def test_a_run_leaves_what_it_promises(whole: Path) -> None:
-    names = {"config.yaml", "metadata.json", "metrics.csv", "evaluation.json", "episode.png"}
-    assert names | {"agent", "phases", "checkpoints", ".lock"} == {p.name for p in whole.iterdir()}
+    names = {"config.yaml", "metadata.json", "metrics.csv", "evaluation.json", "report.html"}
+    names |= {"episode.png", "episode.csv", ".lock"}
+    assert names | {"agent", "phases", "checkpoints"} == {p.name for p in whole.iterdir()}
     assert not list((whole / "checkpoints").iterdir())
     metadata = json.loads((whole / "metadata.json").read_text())
     assert metadata["seconds"].keys() == {"model", "policy", "evaluate"}

@@ -9,10 +9,8 @@ from dataclasses import dataclass
 from html import escape
 from typing import Literal
 
-from matplotlib.ticker import MaxNLocator
-
 _WIDTH, _HEIGHT = 340.0, 190.0
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 8.0, 8.0, 36.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 14.0, 8.0, 36.0
 
 Numbers = Sequence[float | None]
 
@@ -25,7 +23,8 @@ class Series:
         x: places; ``None`` leaves a gap.
         y: values, as many.
         kind: ``"line"``, ``"steps"`` (each value holds until the next), ``"dots"`` or ``"bars"``.
-        color: a class of the page's style: ``"measured"``, ``"model"`` or ``"command"``.
+        color: a class of the page's style: ``"measured"``, ``"model"``, ``"command"`` or
+            ``"third"``.
     """
 
     x: Numbers
@@ -122,6 +121,17 @@ def interval_bar(guess: float, estimate: float, low: float | None, high: float |
     )
 
 
+def figure(svg: str, caption: str = "") -> str:
+    """A picture with a caption, plain text.
+
+    Examples:
+        >>> print(figure("<svg></svg>", "a < b"), end="")
+        <figure><svg></svg><figcaption>a &lt; b</figcaption></figure>
+    """
+    below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    return f"<figure>{svg}{below}</figure>\n"
+
+
 def thin(count: int, most: int) -> list[int]:
     """Places of at most so many of ``count`` entries, at equal distances.
 
@@ -147,6 +157,8 @@ def _axis(
 
 
 def _ticks(axis: _Axis, count: int, whole: bool = False) -> list[tuple[float, str]]:
+    from matplotlib.ticker import MaxNLocator  # here, for most of this folder has to be there early
+
     values = MaxNLocator(nbins=count, integer=whole).tick_values(axis.low, axis.high)
     inside = [float(v) for v in values if axis.low <= v <= axis.high]
     step = min((b - a for a, b in itertools.pairwise(inside)), default=1.0)

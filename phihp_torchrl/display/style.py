@@ -1,4 +1,4 @@
-"""How the page of an identification looks: light and dark, wide, narrow and on paper."""
+"""How a page looks: light and dark, wide, narrow and on paper."""
 
 STYLE = """
 :root { color-scheme: light dark;
@@ -49,6 +49,7 @@ figure { margin: 0; background: var(--card); border-radius: 6px; padding: .5rem;
   break-inside: avoid; }
 figcaption { font-size: .875rem; color: var(--soft); padding: 0 .3rem .2rem; }
 svg.chart { display: block; width: 100%; height: auto; max-width: 30rem; }
+img { display: block; max-width: 100%; height: auto; border-radius: 4px; background: #fff; }
 svg.bar { width: 10rem; height: 1.5rem; }
 svg text { font: 11px system-ui, sans-serif; fill: var(--soft); }
 svg .grid { stroke: var(--line); } svg .axis { stroke: var(--soft); }
@@ -61,6 +62,9 @@ svg path.command { stroke: var(--command); }
 svg path.dots { stroke-width: 3; stroke-linecap: round; }
 svg path.dots.soft { stroke: var(--measured); opacity: .35; }
 svg path.bars { stroke-width: 14; }
+svg path.third { stroke: var(--good); }
+svg path.dots.third, svg path.dots.command { stroke-width: 8; }
+.key.third::before { background: var(--good); }
 .key::before { content: ""; display: inline-block; width: .8em; height: .8em; margin-right: .35em;
   border-radius: 50%; background: var(--measured); }
 .key.model::before { background: var(--model); }
