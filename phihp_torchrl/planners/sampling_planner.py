@@ -208,30 +208,43 @@ class SamplingPlanner(MPCPlannerBase):
             if unknown := [k for k in module.in_keys if unravel_key(k) not in allowed]:
                 raise ValueError(f"{name}: expected in_keys among {allowed}, got {unknown}.")
 
-    def problem(self) -> Problem:
-        """Return model, bounds, actor and value as functions."""
+    def problem(self, *, prepared: bool = False) -> Problem:
+        """Return model, bounds, actor and value as functions.
+
+        Args:
+            prepared: whether they are for one eager plan, which they make faster, and read the
+                weights as they are now. Results are equal up to rounding.
+        """
         action_shape = self.action_spec.shape
         if self.uses_tensors:
             model: TensorModel = self.env.tensor_model
+            if prepared and hasattr(model, "prepared"):
+                model = model.prepared()
         else:
             model = EnvModel(
                 self.env, self.action_key, action_shape, self.reward_key, self.done_keys
             )
         actor = value = None
         if self.actor is not None:
-            actor = actor_function(self.actor, self.action_key, action_shape.numel())
+            numel = action_shape.numel()
+            actor = actor_function(self.actor, self.action_key, numel, prepared=prepared)
         if self.qvalue is not None:
-            value = value_function(self.qvalue, self.value_key, self.action_key, action_shape)
+            keys = (self.value_key, self.action_key)
+            value = value_function(self.qvalue, *keys, action_shape, prepared=prepared)
         return Problem(model=model, bounds=self.bounds, actor=actor, value=value)
 
     def _build(self) -> Callable[..., Any]:
         """Make the plan as a function of observation and noise, compiled if wanted."""
+        if not self._compiles:
+            plan, settings = self._plan, self.settings
+            return lambda *args: plan(
+                *args, problem=self.problem(prepared=True), settings=settings
+            )
         problem = self.problem()
         function = partial(self._plan, problem=problem, settings=self.settings)
         options = dict(self._compile) if isinstance(self._compile, dict) else {}
         return compile_graph(
             function,
-            enabled=self._compiles,
             cpp_wrapper=self._action_low.device.type == "cpu",
             **options,
         )
