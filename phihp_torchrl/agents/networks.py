@@ -97,8 +97,36 @@ class Actor(_Network):
     def forward(self, observation: Tensor) -> Tensor:
         return self.bounds.from_unit(self.mlp(observation).tanh())
 
+    def evaluate(self, observation: Tensor) -> Tensor | None:
+        """The action for one observation ``[o]``, without gradients and calls of modules.
+
+        These calls take longer than the layers. ``None`` for a batch, under autocast, for other
+        layers, and where hooks follow the calls: then call the module.
+        """
+        mlp = self.mlp
+        if (
+            observation.ndim != 1
+            or type(self).forward is not Actor.forward
+            or torch.is_autocast_enabled(observation.device.type)
+            or _is_followed(self)
+            or _is_followed(mlp)
+        ):
+            return None
+        values = observation
+        for part in mlp._modules.values():
+            if part is None or _is_followed(part):
+                return None
+            if type(part) is nn.Linear:
+                layer = part._parameters
+                values = torch.addmv(layer["bias"], layer["weight"], values)  # type: ignore[arg-type]
+            elif type(part) is nn.ReLU:
+                values = values.relu_()
+            else:
+                return None
+        return torch.addcmul(self.center, self.scale, values.tanh())
+
     def prepared(self) -> Callable[[Tensor], Tensor]:
-        """Return the same function without the calls of modules, which take as long as small layers.
+        """Return the same function without calls of modules, which take as long as small layers.
 
         It reads weights that are changed in place, but not parameters that take their place.
         """
@@ -193,7 +221,8 @@ class TwinQ(_Network):
         if type(self).forward is not TwinQ.forward:
             return self
         # One critic at a time: batched products of 64 rows and more take longer.
-        critics = [prepare(layers) for layers in zip(*(each.unbind() for each in self.layers))]
+        columns = [layer.unbind() for layer in self.layers]
+        critics = [prepare(layers) for layers in zip(*columns, strict=True)]
         bounds = self.bounds
 
         def values(observation: Tensor, action: Tensor) -> Tensor:
@@ -214,8 +243,12 @@ def _is_plain(network: nn.Sequential) -> bool:
     """Whether a network is linear layers with ReLU between them, and nobody follows its calls."""
     kinds = [nn.Linear, nn.ReLU] * len(network)
     alike = all(type(part) is kind for part, kind in zip(network, kinds, strict=False))
-    followed = any(part._forward_hooks or part._forward_pre_hooks for part in network.modules())
-    return alike and not followed
+    return alike and not any(map(_is_followed, network.modules()))
+
+
+def _is_followed(module: nn.Module) -> bool:
+    """Whether hooks follow the calls of a module; those of its parts are not asked."""
+    return bool(module._forward_hooks or module._forward_pre_hooks)
 
 
 @torch.no_grad()

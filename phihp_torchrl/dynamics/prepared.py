@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-import torch
+
 from torch import Tensor, nn
 
 from phihp_torchrl.dynamics.hybrid import HybridDynamics
 from phihp_torchrl.dynamics.prior import PhysicsPrior
 from phihp_torchrl.dynamics.residual import ResidualMLP
-from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import Task, Transition
 
 Derivative = Callable[[Tensor, Tensor], Tensor]
@@ -25,9 +24,8 @@ class PreparedModel:
     ends of many steps at once.
 
     Without gradients and graphs, the time of a plan of some hundred rows is that of calling
-    operations, not of their arithmetic. So the constants of the equations are computed once, scales
-    are part of the residual's layers, and an observation that actor, value and residual read is
-    computed once.
+    operations, not of their arithmetic. So the constants of the equations are computed once, and
+    scales and places of components are part of the residual's layers.
 
     Args:
         task: the task.
@@ -47,12 +45,8 @@ class PreparedModel:
 
     def __init__(self, task: Task, dynamics: nn.Module, like: Tensor) -> None:
         self.task = task
-        self._seen: tuple[Tensor, Tensor] | None = None
         self._step = self._make_step(dynamics, like)
-        self._bounds = task.bounds.to(like.device)
-        system = task.system
-        self._angles = [name in system.angles for name in system.state_names]
-        self._plain = type(system).observe is System.observe
+        self._low, self._high = like.new_tensor(task.action_low), like.new_tensor(task.action_high)
 
     def locate(self, observation: Tensor) -> Tensor:
         """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""
@@ -60,13 +54,7 @@ class PreparedModel:
 
     def observe(self, state: Tensor) -> Tensor:
         """State ``[*batch, n]`` -> observation ``[*batch, o]``."""
-        return self.task.observe(state) if self.task.register_count else self._observe(state)
-
-    def observe_first(self, state: Tensor, count: int) -> Tensor:
-        """The observations ``[count, o]`` of the first rows of states ``[rows, n]``."""
-        if self.task.register_count:
-            return self.task.observe(state[:count])
-        return self._observe(state)[:count]
+        return self.task.observe(state)
 
     def transition(self, state: Tensor, action: Tensor) -> Transition:
         """One step: next state ``[rows, n]``, reward and (bool) terminated, each ``[rows]``."""
@@ -77,7 +65,7 @@ class PreparedModel:
         """The commands of actions ``[*batch, m]``; ``None`` where they depend on earlier ones."""
         if self.task.register_count:
             return None
-        return actions.clamp(self._bounds.low, self._bounds.high)
+        return actions.clamp(self._low, self._high)
 
     def advance(
         self, state: Tensor, action: Tensor, command: Tensor | None = None
@@ -102,20 +90,6 @@ class PreparedModel:
         reward, ended = self.task.judge(state, command, next_state)
         return reward, ended if self.task.may_end else None
 
-    def _observe(self, state: Tensor) -> Tensor:
-        """The system's observation of a state; that of the last one is remembered."""
-        if self._seen is None or self._seen[0] is not state:
-            self._seen = (state, self._observed(state))
-        return self._seen[1]
-
-    def _observed(self, state: Tensor) -> Tensor:
-        if not self._plain:
-            return self.task.system.observe(state)
-        columns: list[Tensor] = []
-        for is_angle, each in zip(self._angles, state.unbind(-1), strict=True):
-            columns += [each.cos(), each.sin()] if is_angle else [each]
-        return torch.stack(columns, -1)
-
     def _make_step(self, dynamics: nn.Module, like: Tensor) -> Derivative:
         if not isinstance(dynamics, HybridDynamics):
             return dynamics
@@ -131,12 +105,8 @@ class PreparedModel:
             return dynamics.derivative
         if type(prior) is PhysicsPrior:
             prior = _with_constants(prior)
-        corrected = residual.prepared() if type(residual) is ResidualMLP else None
-        if corrected is not None:
-
-            def residual(state: Tensor, action: Tensor) -> Tensor:
-                return corrected(self._observe(state), action)
-
+        if type(residual) is ResidualMLP:
+            residual = residual.prepared() or residual
         if prior is None or residual is None:
             return prior or residual  # type: ignore[return-value]  # one of them is there
         return lambda state, action: prior(state, action) + residual(state, action)

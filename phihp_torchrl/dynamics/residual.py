@@ -20,9 +20,6 @@ ACTIVATIONS = MappingProxyType(
 # Those that are faster to call as functions.
 _FUNCTIONS: dict[type[nn.Module], Any] = {nn.ReLU: torch.relu, nn.Tanh: torch.tanh}
 
-Prepared = Callable[[Tensor, Tensor], Tensor]
-"""``observation [rows, o], action [rows, m] -> ds/dt [rows, n]``."""
-
 
 class ResidualMLP(nn.Module):
     """F^r(s, a; theta_r): an MLP from observation and action to components of ds/dt.
@@ -105,18 +102,21 @@ class ResidualMLP(nn.Module):
         inputs = torch.cat([self.system.observe(state), action], -1) * self.input_scale
         return self._spread_out(self.network(inputs) * self.output_scale)
 
-    def prepared(self) -> Prepared | None:
-        """Return the same function of observation and action, with the scales in its layers.
+    def prepared(self) -> Callable[[Tensor, Tensor], Tensor] | None:
+        """Return the same function of matrices, with scales and places as part of its layers.
 
-        It is for matrices ``[rows, o]``, ``[rows, m]`` without gradients, and reads the weights as
-        they are now. ``None`` for a network that is not what this class makes.
+        It is for states ``[rows, n]`` and actions ``[rows, m]`` without gradients, and reads the
+        weights as they are now. ``None`` where the network or the system's observation is another
+        than this class knows.
         """
+        if type(self.system).observe is not System.observe:
+            return None
         layers, between = list(self.network)[::2], list(self.network)[1::2]
         if not all(type(layer) is nn.Linear for layer in layers) or _watched(self.network):
             return None
         weights = [layer.weight.t() for layer in layers]
         biases = [layer.bias for layer in layers]
-        weights[0] = self.input_scale[:, None] * weights[0]
+        weights[0] = self._from_features(self.input_scale[:, None] * weights[0])
         places = list(self.outputs)
         last = weights[-1].new_zeros(weights[-1].shape[0] + 1, self.system.state_dim)
         last[:-1, places] = weights[-1] * self.output_scale
@@ -126,13 +126,26 @@ class ResidualMLP(nn.Module):
         called = [_FUNCTIONS.get(type(each), each) for each in between]
         rest = list(zip(called, weights[1:], biases[1:], strict=True))
 
-        def residual(observation: Tensor, action: Tensor) -> Tensor:
-            values = torch.addmm(first[1], torch.cat([observation, action], -1), first[0])
+        def residual(state: Tensor, action: Tensor) -> Tensor:
+            # Fewer operations than to take the angles apart from the other components.
+            features = torch.cat([state.cos(), state.sin(), state, action], -1)
+            values = torch.addmm(first[1], features, first[0])
             for activation, weight, bias in rest:
                 values = torch.addmm(bias, activation(values), weight)
             return values
 
         return residual
+
+    def _from_features(self, weight: Tensor) -> Tensor:
+        """The first layer for cosines, sines and values of all components, and the action."""
+        system, n = self.system, self.system.state_dim
+        columns: list[int] = []
+        for i in range(n):
+            columns += [i, n + i] if i in system.angle_indices else [2 * n + i]
+        columns += range(3 * n, 3 * n + system.acting_dim)
+        whole = weight.new_zeros(3 * n + system.acting_dim, weight.shape[1])
+        whole[columns] = weight
+        return whole
 
     def _spread_out(self, values: Tensor) -> Tensor:
         """Outputs ``[..., outputs]`` in their places among the components, ``[..., n]``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import WorldModel
@@ -70,7 +71,7 @@ class TaskWorldModel(WorldModel):
         ours += [(type(self.task), Task, name) for name in ("transition", "is_terminated")]
         if any(getattr(kind, name) is not getattr(base, name) for kind, base, name in ours):
             return self
-        like = next(self.transitions.parameters(), self.task.bounds.low)
+        like = next(self.transitions.parameters(), torch.empty(0))
         return PreparedModel(self.task, self.transitions, like.detach())
 
     def locate(self, observation: Tensor) -> Tensor:

@@ -128,8 +128,6 @@ class _Guide:
     ) -> None:
         self.problem, self.noise, self.completed, self.last = problem, noise, completed, horizon - 1
         self.acts = noise is not None or completed > 0
-        # A prepared model remembers the observation of all rows, which the step needs as well.
-        self.observe_first = getattr(problem.model, "observe_first", None)
 
     def __call__(self, k: int, state: Any, action: Tensor) -> Tensor:
         noise = None if self.noise is None else self.noise[k]
@@ -140,11 +138,7 @@ class _Guide:
             return action
         problem, guided = self.problem, noise.shape[0]
         assert problem.actor is not None
-        if self.observe_first is None:
-            observation = problem.model.observe(state[:guided])
-        else:
-            observation = self.observe_first(state, guided)
-        proposal = problem.actor(observation) + noise
+        proposal = problem.actor(problem.model.observe(state[:guided])) + noise
         return torch.cat([problem.bounds.clip(proposal), action[guided:]])
 
 
