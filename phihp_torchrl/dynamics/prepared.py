@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from typing import Any
 
 from torch import Tensor, nn
 
@@ -100,7 +101,8 @@ class PreparedModel:
         return lambda state, action: solve(lambda s: derivative(s, action), state)
 
     def _make_derivative(self, dynamics: HybridDynamics) -> Derivative:
-        prior, residual = dynamics.prior, dynamics.residual
+        prior: Any = dynamics.prior
+        residual: Any = dynamics.residual
         if type(dynamics).derivative is not HybridDynamics.derivative:
             return dynamics.derivative
         if type(prior) is PhysicsPrior:
@@ -108,14 +110,14 @@ class PreparedModel:
         if type(residual) is ResidualMLP:
             residual = residual.prepared() or residual
         if prior is None or residual is None:
-            return prior or residual  # type: ignore[return-value]  # one of them is there
+            return prior or residual  # one of them is there
         return lambda state, action: prior(state, action) + residual(state, action)
 
 
 def _with_constants(prior: PhysicsPrior) -> Derivative:
     """The prior with the constants that it has now, and their combinations, computed once."""
     constants = prior.constants()
-    system = copy.copy(prior.system)
+    system: Any = copy.copy(prior.system)
     combined = system.identifiable(constants)
-    system.identifiable = lambda _: combined  # type: ignore[method-assign]
+    system.identifiable = lambda _: combined
     return lambda state, action: system.prior(state, action, constants)

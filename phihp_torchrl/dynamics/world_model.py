@@ -67,9 +67,15 @@ class TaskWorldModel(WorldModel):
 
         It is this model itself where a subclass, of the model or of the task, steps differently.
         """
-        ours = [(type(self), TaskWorldModel, name) for name in ("locate", "observe", "transition")]
-        ours += [(type(self.task), Task, name) for name in ("transition", "is_terminated")]
-        if any(getattr(kind, name) is not getattr(base, name) for kind, base, name in ours):
+        ours: dict[tuple[type, type], tuple[str, ...]] = {
+            (type(self), TaskWorldModel): ("locate", "observe", "transition"),
+            (type(self.task), Task): ("transition", "is_terminated"),
+        }
+        if any(
+            getattr(kind, name) is not getattr(base, name)
+            for (kind, base), names in ours.items()
+            for name in names
+        ):
             return self
         like = next(self.transitions.parameters(), torch.empty(0))
         return PreparedModel(self.task, self.transitions, like.detach())

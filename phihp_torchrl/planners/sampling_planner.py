@@ -254,13 +254,12 @@ class SamplingPlanner(MPCPlannerBase):
         twin._compiles = False
         device = self._action_low.device
         twin.generator = torch.Generator(device).manual_seed(0)
-        eager = twin._build()
 
-        def called(*args: Any) -> Any:
-            calls.append((args, eager(*args)))
+        def plan(*args: Any, **fixed: Any) -> Any:
+            calls.append((args, self._plan(*args, **fixed)))
             return calls[-1][1]
 
-        twin._build = lambda: called  # type: ignore[method-assign]
+        twin._plan = plan
         with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
             twin.planning(tensordict)
         ((key, _),) = twin._planning_functions.items()
