@@ -30,6 +30,25 @@ def mlp(layers: Layers, inputs: Tensor) -> Tensor:
     return F.linear(inputs, layers[-2], layers[-1])
 
 
+def prepare(layers: Layers) -> Callable[[Tensor], Tensor]:
+    """Return :func:`mlp` of these layers as a function for many calls without gradients.
+
+    It reads weights that are changed in place.
+    """
+    *hidden, last = zip(layers[::2], layers[1::2], strict=True)
+    pairs = [(weight.t(), bias) for weight, bias in hidden]
+    weight, bias = last[0].t(), last[1]
+
+    def network(inputs: Tensor) -> Tensor:
+        if inputs.ndim != 2 or torch.is_autocast_enabled(inputs.device.type):
+            return mlp(layers, inputs)
+        for each, shift in pairs:
+            inputs = torch.addmm(shift, inputs, each).relu_()
+        return torch.addmm(bias, inputs, weight)
+
+    return network
+
+
 def act(actor: Layers, observation: Tensor, bounds: ActionBounds) -> Tensor:
     """Evaluate the actor's layers: observations ``[N, o]`` to actions ``[N, m]`` in bounds.
 

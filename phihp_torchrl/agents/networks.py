@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from phihp_torchrl.agents.equations import Layers, q_values
+from phihp_torchrl.agents.equations import Layers, prepare, q_values
 from phihp_torchrl.config import ConfigError, check_widths
 from phihp_torchrl.tasks import ActionBounds, Task
 
@@ -97,6 +97,44 @@ class Actor(_Network):
     def forward(self, observation: Tensor) -> Tensor:
         return self.bounds.from_unit(self.mlp(observation).tanh())
 
+    def evaluate(self, observation: Tensor) -> Tensor | None:
+        """The action for one observation ``[o]``, without gradients and calls of modules.
+
+        These calls take longer than the layers. ``None`` for a batch, under autocast, for other
+        layers, and where hooks follow the calls: then call the module.
+        """
+        mlp = self.mlp
+        if (
+            observation.ndim != 1
+            or type(self).forward is not Actor.forward
+            or torch.is_autocast_enabled(observation.device.type)
+            or _is_followed(self)
+            or _is_followed(mlp)
+        ):
+            return None
+        values = observation
+        for part in mlp._modules.values():
+            if part is None or _is_followed(part):
+                return None
+            if type(part) is nn.Linear:
+                layer = part._parameters
+                values = torch.addmv(layer["bias"], layer["weight"], values)  # type: ignore[arg-type]
+            elif type(part) is nn.ReLU:
+                values = values.relu_()
+            else:
+                return None
+        return torch.addcmul(self.center, self.scale, values.tanh())
+
+    def prepared(self) -> Callable[[Tensor], Tensor]:
+        """Return the same function without calls of modules, which take as long as small layers.
+
+        It reads weights that are changed in place, but not parameters that take their place.
+        """
+        if type(self).forward is not Actor.forward or not _is_plain(self.mlp):
+            return self
+        network, bounds = prepare(list(self.mlp.parameters())), self.bounds
+        return lambda observation: bounds.from_unit(network(observation).tanh())
+
     @classmethod
     def from_layers(cls, task: Task, layers: Layers) -> Actor:
         """Build an actor with copies of the layers ``(weight, bias, …)`` that TD3 trains."""
@@ -175,12 +213,42 @@ class TwinQ(_Network):
         )
         return values.mT.reshape(*batch, -1)
 
+    def prepared(self) -> Callable[[Tensor, Tensor], Tensor]:
+        """Return the same function of matrices, without the calls of modules.
+
+        It reads weights that are changed in place, but not parameters that take their place.
+        """
+        if type(self).forward is not TwinQ.forward:
+            return self
+        # One critic at a time: batched products of 64 rows and more take longer.
+        columns = [layer.unbind() for layer in self.layers]
+        critics = [prepare(layers) for layers in zip(*columns, strict=True)]
+        bounds = self.bounds
+
+        def values(observation: Tensor, action: Tensor) -> Tensor:
+            inputs = torch.cat([observation, bounds.to_unit(action)], -1)
+            return torch.cat([critic(inputs) for critic in critics], -1)
+
+        return values
+
     @classmethod
     def from_layers(cls, task: Task, layers: Layers) -> TwinQ:
         """Build critics with copies of the stacked layers ``(weight, bias, …)`` that TD3 trains."""
         critics = cls(task, [weight.shape[1] for weight in layers[:-2:2]])
         _copy_layers(list(critics.layers), layers)
         return critics
+
+
+def _is_plain(network: nn.Sequential) -> bool:
+    """Whether a network is linear layers with ReLU between them, and nobody follows its calls."""
+    kinds = [nn.Linear, nn.ReLU] * len(network)
+    alike = all(type(part) is kind for part, kind in zip(network, kinds, strict=False))
+    return alike and not any(map(_is_followed, network.modules()))
+
+
+def _is_followed(module: nn.Module) -> bool:
+    """Whether hooks follow the calls of a module; those of its parts are not asked."""
+    return bool(module._forward_hooks or module._forward_pre_hooks)
 
 
 @torch.no_grad()

@@ -6,15 +6,22 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 
 from phihp_torchrl.agents import Actor, TwinQ
 from phihp_torchrl.config import ConfigError, kind_mapping, read_kind, resolve_seconds
 from phihp_torchrl.deployment.under_way import UnderWay
+from phihp_torchrl.deployment.warm_up import WarmUp
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
-from phihp_torchrl.planners import PLANNERS, SamplingPlanner, SearchConfig, make_planner
+from phihp_torchrl.planners import (
+    PLANNERS,
+    SamplingPlanner,
+    SearchConfig,
+    is_finite,
+    make_planner,
+)
 from phihp_torchrl.tasks import Task
 
 
@@ -96,6 +103,7 @@ class Agent(TensorDictModuleBase):
         self.metadata = dict(metadata or {})
         self._memory = UnderWay(task, dynamics) if task.register_count else None
         self.planner = None
+        self._warm_up: WarmUp | None = None
         if use_planner and planner_config is not None:
             self.planner = self._make_planner(planner_config, compile)
         elif actor is None:
@@ -137,19 +145,66 @@ class Agent(TensorDictModuleBase):
     def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.planner is not None:
             return self._plan(tensordict)
-        self._check(tensordict.get("observation", None), tensordict.batch_size)
-        return self.actor(tensordict)  # type: ignore[misc]  # one of the two is there
+        observation = self._check(tensordict.get("observation", None), tensordict.batch_size)
+        network, action = getattr(self.actor, "module", None), None
+        if isinstance(network, Actor) and not _is_followed(self.actor):
+            action = network.evaluate(observation)
+        if action is None:
+            return self.actor(tensordict)  # type: ignore[misc]  # one of the two is there
+        return tensordict.set("action", action)
 
     def _plan(self, tensordict: TensorDictBase) -> TensorDictBase:
         assert self.planner is not None
         return self.planner(tensordict)
 
+    def _planner_input(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """What the planner is given for an observation."""
+        return tensordict
+
+    def example(self) -> TensorDictBase:
+        """What the planner is given for one observation where an episode starts."""
+        tensor = next(self.parameters())
+        state = self.task.sample_start([], torch.Generator().manual_seed(0))
+        observation = self.task.observe(state).to(tensor)
+        starts = torch.ones(1, dtype=torch.bool, device=tensor.device)
+        with torch.no_grad():
+            return self._planner_input(TensorDict(observation=observation, is_init=starts))
+
+    def warm_up(self, *, background: bool = False) -> WarmUp:
+        """Compile the plan for one observation at a time, before an episode needs it.
+
+        In the foreground that takes 10 to 60 s the first time, and seconds from the compiler's
+        cache. In the background another process compiles it (an AOTInductor package, with the
+        weights as they are now); the agent plans eagerly meanwhile, and takes the compiled plan at
+        the first :meth:`reset` after it is ready, so that no step of an episode waits for it.
+
+        Args:
+            background: whether to return at once.
+
+        Returns:
+            What is under way: ``ready``, and ``wait(seconds)``, which takes the plan as well.
+
+        Examples:
+            >>> from phihp_torchrl import load_agent
+            >>> agent = load_agent("results/agents/pendulum")  # doctest: +SKIP
+            >>> agent.warm_up().ready  # doctest: +SKIP
+            True
+        """
+        self._warm_up = WarmUp(self, background=background)
+        return self._warm_up
+
     def reset(self) -> None:
         """Drop the previous plan and what is under way, at the start of an episode."""
+        if self._warm_up is not None and self._warm_up.take():
+            self._warm_up = None
         if self.planner is not None:
             self.planner.reset()
         if self._memory is not None:
             self._memory.reset()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy, or another process, does not wait for what is compiled for this one.
+        return {**super().__getstate__(), "_warm_up": None}
 
     def actor_alone(self) -> Agent:
         """Return the same agent without planning, with the same modules."""
@@ -231,11 +286,15 @@ class Agent(TensorDictModuleBase):
             planner = read_kind(PLANNERS, planner, "planner")
         return cls(task, **modules, planner_config=planner, **options)
 
-    def _check(self, observation: Tensor | None, batch: torch.Size) -> None:
+    def _check(self, observation: Tensor | None, batch: torch.Size) -> Tensor:
         shape = [*batch, self.task.observation_dim]
         if observation is None:
             raise ValueError(f"observation: expected a tensor of shape {shape}, got none.")
-        parameter = next(self.actor.parameters(), observation)  # type: ignore[union-attr]
+        network = getattr(self.actor, "module", None)
+        if isinstance(network, Actor):
+            parameter = network.center  # found faster than a parameter
+        else:
+            parameter = next(self.actor.parameters(), observation)  # type: ignore[union-attr]
         expected = (torch.Size(shape), parameter.dtype, parameter.device)
         if (observation.shape, observation.dtype, observation.device) != expected:
             raise ValueError(
@@ -243,5 +302,11 @@ class Agent(TensorDictModuleBase):
                 f"got {observation.dtype} of shape {list(observation.shape)} "
                 f"on {observation.device}."
             )
-        if observation.device.type == "cpu" and not observation.isfinite().all():
+        if observation.device.type == "cpu" and not is_finite(observation):
             raise ValueError("observation: expected finite observations, got some that are not.")
+        return observation
+
+
+def _is_followed(module: Any) -> bool:
+    """Whether somebody follows the calls of a module, but not those of its parts."""
+    return bool(module._forward_hooks or module._forward_pre_hooks)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shutil
 import tempfile
@@ -34,10 +35,19 @@ from phihp_torchrl.deployment.formats import (
     TaskSignature,
     upgrade,
 )
+from phihp_torchrl.deployment.package import (
+    PACKAGE_FILE,
+    check_package,
+    describe,
+    identify,
+    use_package,
+    write_package,
+)
 from phihp_torchrl.deployment.reading import MAX_JSON_BYTES, AgentError, read_json, read_weights
 from phihp_torchrl.origin import package_version
 from phihp_torchrl.tasks import Actuator, Constraint, Task, get_task
 
+_log = logging.getLogger(__name__)
 AGENT_FILE = "agent.json"
 WEIGHTS_FILE = "weights.safetensors"
 NEXT_WEIGHTS_FILE = ".next-weights.safetensors"
@@ -68,7 +78,11 @@ def register_agent(agent: type[Agent], *, replace: bool = False) -> type[Agent]:
 
 
 def save_agent(
-    agent: Agent, directory: str | os.PathLike[str], *, metadata: Mapping[str, Any] | None = None
+    agent: Agent,
+    directory: str | os.PathLike[str],
+    *,
+    metadata: Mapping[str, Any] | None = None,
+    packaged: bool = False,
 ) -> Path:
     """Save an agent as ``agent.json`` and ``weights.safetensors``, keeping other files.
 
@@ -82,6 +96,8 @@ def save_agent(
         metadata: further information for people, as JSON values with finite numbers; by convention
             ``seed``, ``commit``, ``command``, ``samples``, ``config`` and ``returns``. Defaults to
             ``agent.metadata``.
+        packaged: whether to compile the plan too, as ``packaged_plan.pt2`` for this platform, which
+            takes a minute; :func:`load_agent` loads it in less than a second if asked.
 
     Returns:
         The directory.
@@ -145,6 +161,11 @@ def save_agent(
         os.replace(Path(temporary, WEIGHTS_FILE), directory / NEXT_WEIGHTS_FILE)
         os.replace(Path(temporary, AGENT_FILE), directory / AGENT_FILE)
         os.replace(directory / NEXT_WEIGHTS_FILE, directory / WEIGHTS_FILE)
+        if packaged:
+            made = Path(temporary, PACKAGE_FILE)
+            write_package(agent, made)
+            os.replace(made, directory / PACKAGE_FILE)
+            describe(directory / PACKAGE_FILE, identify(json.loads(text)))
     return directory
 
 
@@ -155,11 +176,12 @@ def load_agent(
     task: str | Task | None = None,
     device: torch.device | str | None = None,
     compile: bool | dict[str, Any] = False,
+    packaged: bool = False,
 ) -> Agent:
     """Load a saved agent, ready to act.
 
-    Nothing in the files is executed, and the sizes of the weights are checked before memory is
-    allocated for them.
+    Nothing in the files is executed unless ``packaged`` asks for it, and the sizes of the weights
+    are checked before memory is allocated for them.
 
     Args:
         directory: the directory that :func:`save_agent` wrote.
@@ -167,10 +189,17 @@ def load_agent(
             metadata say ``"acting": "actor"``: calibration found no plan that beats its actor.
         task: the task that it must be for: a name, or a task that need not be registered.
         device: device of the agent. Defaults to the CPU.
-        compile: whether to compile the plan.
+        compile: whether to compile the plan at its first call. Without it the agent plans at once
+            and eagerly; see also :meth:`Agent.warm_up`.
+        packaged: whether to plan by the native code of ``packaged_plan.pt2`` beside the agent, for
+            one observation at a time on the CPU. A package is a program that runs with your rights,
+            so ask for it only where you trust whoever wrote it. If there is none, or it is of
+            another agent, torch, platform or processor, a warning says so and the agent plans
+            eagerly.
 
     Raises:
-        AgentError: if a file is missing, damaged, of another version or another task.
+        AgentError: if both ``compile`` and ``packaged`` are asked for, or a file is missing,
+            damaged, of another version or another task.
 
     Examples:
         >>> import tempfile
@@ -212,6 +241,8 @@ def load_agent(
     except ValueError as error:
         raise AgentError(f"{path}: {error}.") from error
     device = _check_device(device)
+    if packaged and compile:
+        raise AgentError("packaged: expected it without compile, got both.")
     try:
         parts = kind.build_modules(task, content)
         for name, part in parts.items():
@@ -219,7 +250,7 @@ def load_agent(
             own = {k.removeprefix(start): t for k, t in weights.items() if k.startswith(start)}
             part.load_state_dict(own)
             part.to(device).requires_grad_(False).eval()
-        return kind.from_config(
+        agent = kind.from_config(
             task,
             content,
             parts,
@@ -231,6 +262,21 @@ def load_agent(
         raise AgentError(f"{path}: expected the key {error}, found none.") from error
     except (ValueError, TypeError, RuntimeError) as error:
         raise AgentError(f"{path}: the agent can not be built: {error}") from error
+    if packaged:
+        _take_package(agent, directory / PACKAGE_FILE, identify(read_json(path)), device)
+    return agent
+
+
+def _take_package(agent: Agent, path: Path, identity: str, device: torch.device) -> None:
+    try:
+        if agent.planner is None:
+            raise AgentError("packaged: expected an agent that plans, got one without a planner.")
+        if device.type != "cpu":
+            raise AgentError(f"packaged: expected the CPU, for which it is made, got {device}.")
+        check_package(path, identity)
+        use_package(agent, path)
+    except (AgentError, RuntimeError) as error:
+        _log.warning("The agent plans eagerly: %s", error)
 
 
 def _find_kind(kind: Any) -> type[Agent]:

@@ -8,15 +8,17 @@ import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
-from phihp_torchrl.deployment.export_modules import ExportModule
 from phihp_torchrl.deployment.formats import TaskSignature
 from phihp_torchrl.deployment.reading import AgentError, read_json
 from phihp_torchrl.origin import package_version
 from phihp_torchrl.tasks import Task
+
+if TYPE_CHECKING:
+    from phihp_torchrl.deployment.export_modules import ExportModule
 
 FORMAT = "phihp_torchrl export"
 

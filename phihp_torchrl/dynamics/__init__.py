@@ -20,6 +20,7 @@ from phihp_torchrl.dynamics.held_out import (
 from phihp_torchrl.dynamics.hybrid import PRIORS, RESIDUAL_OUTPUTS, HybridDynamics
 from phihp_torchrl.dynamics.loss import DynamicsLoss
 from phihp_torchrl.dynamics.per_life import per_life
+from phihp_torchrl.dynamics.prepared import PreparedModel
 from phihp_torchrl.dynamics.prior import PhysicsPrior, perturbed_constants
 from phihp_torchrl.dynamics.ranks import signed_rank
 from phihp_torchrl.dynamics.residual import ACTIVATIONS, ResidualMLP

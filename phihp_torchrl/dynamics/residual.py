@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -17,6 +17,8 @@ ACTIVATIONS = MappingProxyType(
     {kind.__name__: kind for kind in (nn.ReLU, nn.Tanh, nn.SiLU, nn.ELU, nn.GELU, nn.Softplus)}
 )
 """Activations of a residual, by the name of their class."""
+# Those that are faster to call as functions.
+_FUNCTIONS: dict[type[nn.Module], Any] = {nn.ReLU: torch.relu, nn.Tanh: torch.tanh}
 
 
 class ResidualMLP(nn.Module):
@@ -100,6 +102,51 @@ class ResidualMLP(nn.Module):
         inputs = torch.cat([self.system.observe(state), action], -1) * self.input_scale
         return self._spread_out(self.network(inputs) * self.output_scale)
 
+    def prepared(self) -> Callable[[Tensor, Tensor], Tensor] | None:
+        """Return the same function of matrices, with scales and places as part of its layers.
+
+        It is for states ``[rows, n]`` and actions ``[rows, m]`` without gradients, and reads the
+        weights as they are now. ``None`` where the network or the system's observation is another
+        than this class knows.
+        """
+        if type(self.system).observe is not System.observe:
+            return None
+        layers, between = list(self.network)[::2], list(self.network)[1::2]
+        if not all(type(layer) is nn.Linear for layer in layers) or _watched(self.network):
+            return None
+        weights = [layer.weight.t() for layer in layers]
+        biases = [layer.bias for layer in layers]
+        weights[0] = self._from_features(self.input_scale[:, None] * weights[0])
+        places = list(self.outputs)
+        last = weights[-1].new_zeros(weights[-1].shape[0] + 1, self.system.state_dim)
+        last[:-1, places] = weights[-1] * self.output_scale
+        last[-1, places] = biases[-1] * self.output_scale
+        weights[-1], biases[-1] = last[:-1], last[-1]
+        first = (weights[0], biases[0])
+        called = [_FUNCTIONS.get(type(each), each) for each in between]
+        rest = list(zip(called, weights[1:], biases[1:], strict=True))
+
+        def residual(state: Tensor, action: Tensor) -> Tensor:
+            # Fewer operations than to take the angles apart from the other components.
+            features = torch.cat([state.cos(), state.sin(), state, action], -1)
+            values = torch.addmm(first[1], features, first[0])
+            for activation, weight, bias in rest:
+                values = torch.addmm(bias, activation(values), weight)
+            return values
+
+        return residual
+
+    def _from_features(self, weight: Tensor) -> Tensor:
+        """The first layer for cosines, sines and values of all components, and the action."""
+        system, n = self.system, self.system.state_dim
+        columns: list[int] = []
+        for i in range(n):
+            columns += [i, n + i] if i in system.angle_indices else [2 * n + i]
+        columns += range(3 * n, 3 * n + system.acting_dim)
+        whole = weight.new_zeros(3 * n + system.acting_dim, weight.shape[1])
+        whole[columns] = weight
+        return whole
+
     def _spread_out(self, values: Tensor) -> Tensor:
         """Outputs ``[..., outputs]`` in their places among the components, ``[..., n]``."""
         columns = dict(zip(self.outputs, values.unbind(-1), strict=True))
@@ -123,3 +170,8 @@ class ResidualMLP(nn.Module):
 def spread(values: Tensor) -> Tensor:
     """Standard deviation ``[k]`` of the columns of ``values`` ``[N, k]``, at least 1e-3."""
     return values.std(0, correction=min(1, len(values) - 1)).clamp_min(1e-3)  # one row: zero
+
+
+def _watched(module: nn.Module) -> bool:
+    """Whether somebody follows the calls of a module or of its parts."""
+    return any(part._forward_hooks or part._forward_pre_hooks for part in module.modules())

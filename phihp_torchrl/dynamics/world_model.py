@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import WorldModel
 
 from phihp_torchrl.dynamics.hybrid import HybridDynamics
+from phihp_torchrl.dynamics.prepared import PreparedModel
 from phihp_torchrl.tasks import Step, Task, Transition
 
 
@@ -59,6 +61,24 @@ class TaskWorldModel(WorldModel):
         """Whether :meth:`transition` compiles as one graph; not with an adaptive integrator."""
         integrator = getattr(self.transitions, "integrator", None)
         return integrator is None or integrator.compiles
+
+    def prepared(self) -> PreparedModel | TaskWorldModel:
+        """The same functions for one eager plan, which does not follow later changes of weights.
+
+        It is this model itself where a subclass, of the model or of the task, steps differently.
+        """
+        ours: dict[tuple[type, type], tuple[str, ...]] = {
+            (type(self), TaskWorldModel): ("locate", "observe", "transition"),
+            (type(self.task), Task): ("transition", "is_terminated"),
+        }
+        if any(
+            getattr(kind, name) is not getattr(base, name)
+            for (kind, base), names in ours.items()
+            for name in names
+        ):
+            return self
+        like = next(self.transitions.parameters(), torch.empty(0))
+        return PreparedModel(self.task, self.transitions, like.detach())
 
     def locate(self, observation: Tensor) -> Tensor:
         """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""

@@ -15,6 +15,8 @@ from phihp_torchrl.config import ConfigError, check_count
 
 Derivative = Callable[[Tensor], Tensor]
 """A vector field ``state [*batch, n] -> ds/dt [*batch, n]``, for an action that is held."""
+Solver = Callable[[Derivative, Tensor], Tensor]
+"""A step of fixed length: ``derivative, state [rows, n] -> next state [rows, n]``."""
 Impulse = Callable[[int, Tensor], Tensor]
 """``pair, state [*batch, n] -> [*batch, n]``: how the velocities change, per change of that one."""
 TimeStep = float | Tensor
@@ -170,6 +172,15 @@ class Integrator(abc.ABC):
 
         The time step is a number, or a tensor ``[*batch, 1]`` with one for each state.
         """
+
+    def prepared(self, time_step: float, layout: StateLayout, like: Tensor) -> Solver:
+        """Return the same step as a function of derivative and state, for many calls.
+
+        A subclass may compute once what does not change from call to call, for states that are
+        matrices ``[rows, n]`` of the dtype and on the device of ``like``. Results are those of
+        ``__call__`` up to rounding; a row with a component that is not finite may lose the others.
+        """
+        return lambda derivative, state: self(derivative, state, time_step, layout)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from phihp_torchrl.planners.mppi import MPPIConfig, MPPINoise, MPPIPlan, mppi_pl
 from phihp_torchrl.planners.mppi_planner import MPPIPlanner
 from phihp_torchrl.planners.problem import Problem, TensorModel, score_sequences
 from phihp_torchrl.planners.registry import PLANNERS, PlannerKind, make_planner, register_planner
-from phihp_torchrl.planners.sampling_planner import SamplingPlanner
+from phihp_torchrl.planners.sampling_planner import SamplingPlanner, is_finite
 from phihp_torchrl.planners.search import SearchConfig
 
 __all__ = [

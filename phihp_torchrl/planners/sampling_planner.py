@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import logging
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Sequence
 from contextlib import nullcontext
@@ -209,30 +211,84 @@ class SamplingPlanner(MPCPlannerBase):
             if unknown := [k for k in module.in_keys if unravel_key(k) not in allowed]:
                 raise ValueError(f"{name}: expected in_keys among {allowed}, got {unknown}.")
 
-    def problem(self) -> Problem:
-        """Return model, bounds, actor and value as functions."""
+    def problem(self, *, prepared: bool = False) -> Problem:
+        """Return model, bounds, actor and value as functions.
+
+        Args:
+            prepared: whether they are for one eager plan, which they make faster, and read the
+                weights as they are now. Results are equal up to rounding.
+        """
         action_shape = self.action_spec.shape
         if self.uses_tensors:
             model: TensorModel = self.env.tensor_model
+            if prepared and hasattr(model, "prepared"):
+                model = model.prepared()
         else:
             model = EnvModel(
                 self.env, self.action_key, action_shape, self.reward_key, self.done_keys
             )
         actor = value = None
         if self.actor is not None:
-            actor = actor_function(self.actor, self.action_key, action_shape.numel())
+            numel = action_shape.numel()
+            actor = actor_function(self.actor, self.action_key, numel, prepared=prepared)
         if self.qvalue is not None:
-            value = value_function(self.qvalue, self.value_key, self.action_key, action_shape)
+            keys = (self.value_key, self.action_key)
+            value = value_function(self.qvalue, *keys, action_shape, prepared=prepared)
         return Problem(model=model, bounds=self.bounds, actor=actor, value=value)
 
-    def _build(self) -> Callable[..., Any]:
+    def why_not_compiled(self) -> str | None:
+        """Return the reason why the plan cannot be compiled, or ``None``."""
+        if not self.uses_tensors:
+            return "it steps the environment"
+        if not getattr(self.env.tensor_model, "compiles", True):
+            return "the model's integrator does not compile"
+        return None
+
+    def example_call(self, tensordict: TensorDictBase) -> tuple[Any, tuple[Any, ...], Any]:
+        """Plan eagerly once, leaving the planner and torch's generators as they were.
+
+        Returns:
+            The key of the plan's function, the arguments it was called with, and what it returned.
+        """
+        twin, calls = copy.copy(self), list[tuple[Any, Any]]()
+        twin.receding = copy.copy(self.receding)
+        twin._compiles = False
+        device = self._action_low.device
+        twin.generator = torch.Generator(device).manual_seed(0)
+
+        def plan(*args: Any, **fixed: Any) -> Any:
+            calls.append((args, self._plan(*args, **fixed)))
+            return calls[-1][1]
+
+        twin._plan = plan
+        with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+            twin.planning(tensordict)
+        ((key, _),) = twin._planning_functions.items()
+        ((args, result),) = calls
+        return key, args, result
+
+    def replace_plan(self, key: Any, function: Callable[..., Any]) -> None:
+        """Plan by another function of the same arguments, for the key of :meth:`example_call`."""
+        self._planning_functions[key] = function
+
+    def compile_plan(self, tensordict: TensorDictBase) -> None:
+        """Compile the plan for observations of this batch size, and plan by that from now on."""
+        key, args, _ = self.example_call(tensordict)
+        function = self._build(compiled=True)
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            function(*args)
+        self.replace_plan(key, function)
+
+    def _build(self, *, compiled: bool | None = None) -> Callable[..., Any]:
         """Make the plan as a function of observation and noise, compiled if wanted."""
+        if not (self._compiles if compiled is None else compiled):
+            plan, settings = self._plan, self.settings
+            return lambda *args: plan(*args, problem=self.problem(prepared=True), settings=settings)
         problem = self.problem()
         function = partial(self._plan, problem=problem, settings=self.settings)
         options = dict(self._compile) if isinstance(self._compile, dict) else {}
         return compile_graph(
             function,
-            enabled=self._compiles,
             cpp_wrapper=self._action_low.device.type == "cpu",
             **options,
         )
@@ -310,8 +366,13 @@ class SamplingPlanner(MPCPlannerBase):
                     f"got {value.dtype} of shape {list(value.shape)} on {value.device}."
                 )
             # On other devices this would synchronize; the plan then uses the actor's action.
-            if device.type == "cpu" and not value.isfinite().all():
+            if device.type == "cpu" and not is_finite(value):
                 raise ValueError(f"{key}: expected finite observations, got some that are not.")
+
+
+def is_finite(values: Tensor) -> bool:
+    """Whether all values are finite; their sum says so first, in a third of the time."""
+    return math.isfinite(values.sum().item()) or bool(values.isfinite().all())
 
 
 def _shapes(arguments: Any) -> Any:

@@ -230,10 +230,10 @@ class System:
 
     def observe(self, state: Tensor) -> Tensor:
         """Map a state ``[*batch, n]`` to an observation ``[*batch, o]``: angles as (cos, sin)."""
-        angles = self.angle_indices
+        angles = self.angles
         columns: list[Tensor] = []
-        for i, component in enumerate(state.unbind(-1)):
-            columns += [component.cos(), component.sin()] if i in angles else [component]
+        for name, component in zip(self.state_names, state.unbind(-1), strict=True):
+            columns += [component.cos(), component.sin()] if name in angles else [component]
         return torch.stack(columns, -1)
 
     def locate(self, observation: Tensor) -> Tensor:

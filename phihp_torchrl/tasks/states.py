@@ -98,7 +98,8 @@ class States:
     def split(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Split a state ``[*batch, n]`` into its physical components and its registers."""
         size = self.system.state_dim
-        return state[..., :size], state[..., size:]
+        physical = state[..., :size] if self.register_count else state
+        return physical, state[..., size:]
 
     def at_rest(self, physical: Tensor) -> Tensor:
         """The state ``[*batch, n]`` of physical components with nothing under way."""

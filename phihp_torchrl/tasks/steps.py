@@ -95,20 +95,47 @@ class Steps(States):
             The next state, the reward less the prices of :meth:`price`, and whether the episode has
             terminated.
         """
+        command, next_state = self.move(step, state, action)
+        reward, terminated = self.judge(state, command, next_state)
+        return Transition(next_state, reward, terminated)
+
+    def move(self, step: Step, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """The first half of :meth:`transition`: what is commanded, and where it leads.
+
+        Returns:
+            The command ``[*batch, m]`` and the next state ``[*batch, n]``.
+        """
         before, registers = self.split(state)
-        action = self.command(registers, action)
+        command = self.command(registers, action)
         if not self.register_count:
-            next_state = moved = step(state, action)
-        else:
-            acting, after = self.registers.step(registers, action, self.time_step)
-            moved = step(before, acting)
-            if (drift := self.registers.drift(registers)) is not None:
-                moved = moved + self.time_step * drift
-            next_state = torch.cat([moved, after], -1)
-        reward = self.earned(state, action, next_state)
-        if (price := self._price(registers, action, moved)) is not None:
+            return command, step(state, command)
+        acting, after = self.registers.step(registers, command, self.time_step)
+        moved = step(before, acting)
+        if (drift := self.registers.drift(registers)) is not None:
+            moved = moved + self.time_step * drift
+        return command, torch.cat([moved, after], -1)
+
+    def judge(self, state: Tensor, command: Tensor, next_state: Tensor) -> tuple[Tensor, Tensor]:
+        """The second half of :meth:`transition`, for one step or for many at once.
+
+        Args:
+            state: the state before the step, ``[*batch, n]``.
+            command: the command of the step, ``[*batch, m]``.
+            next_state: the state after it, ``[*batch, n]``.
+
+        Returns:
+            The reward less the prices, and (bool) whether the episode ends, each ``[*batch]``.
+        """
+        reward = self.earned(state, command, next_state)
+        (_, registers), (moved, _) = self.split(state), self.split(next_state)
+        if (price := self._price(registers, command, moved)) is not None:
             reward = reward - price
-        return Transition(next_state, reward, self.is_terminated(next_state, action))
+        return reward, self.is_terminated(next_state, command)
+
+    @property
+    def may_end(self) -> bool:
+        """Whether any state can end an episode."""
+        return self.terminated is not None or self.limits.ends_episodes
 
     def earned(self, state: Tensor, command: Tensor, next_state: Tensor) -> Tensor:
         """The reward of a step without prices, ``[*batch]``.

@@ -71,8 +71,10 @@ class TDMPCAgent(Agent):
     def _plan(self, tensordict: TensorDictBase) -> TensorDictBase:
         assert self.planner is not None
         self._check(tensordict.get("observation", None), tensordict.batch_size)
-        latent = self.encoder(tensordict.select("observation", "is_init", strict=False))
-        return tensordict.set("action", self.planner(latent)["action"])
+        return tensordict.set("action", self.planner(self._planner_input(tensordict))["action"])
+
+    def _planner_input(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.encoder(tensordict.select("observation", "is_init", strict=False))
 
     def with_planner(self, config: SearchConfig | None, **options: Any) -> TDMPCAgent:
         """An agent on the same networks that plans by other numbers, or not at all."""

@@ -1,0 +1,144 @@
+"""A plan as native code: an AOTInductor package of exactly what a planner calls at each step."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils import _pytree as pytree
+
+from phihp_torchrl.deployment.manifest import platform_name, processor, torch_version
+from phihp_torchrl.deployment.reading import AgentError, read_json
+from phihp_torchrl.origin import package_version
+from phihp_torchrl.planners import SamplingPlanner
+
+if TYPE_CHECKING:
+    from phihp_torchrl.deployment.agent import Agent
+
+PACKAGE_FILE = "packaged_plan.pt2"
+_FORMAT = "phihp_torchrl packaged plan"
+# Largest relative difference of scores from the eager plan's, for the same noise.
+_TOLERANCE = 0.01
+
+
+class _Plan(nn.Module):
+    """The plan of a planner as a module of flat tensors; other arguments are constants."""
+
+    def __init__(self, planner: SamplingPlanner, arguments: tuple[Any, ...]) -> None:
+        super().__init__()
+        self.planner = planner  # whose parameters are then this module's
+        self.leaves, self.spec = pytree.tree_flatten(arguments)
+
+    def forward(self, *tensors: Tensor) -> list[Tensor]:
+        given = iter(tensors)
+        leaves = [next(given) if isinstance(leaf, Tensor) else leaf for leaf in self.leaves]
+        planner = self.planner
+        found = planner._plan(
+            *pytree.tree_unflatten(leaves, self.spec),
+            problem=planner.problem(),
+            settings=planner.settings,
+        )
+        return pytree.tree_leaves(found)
+
+
+def write_package(agent: Agent, path: Path) -> None:
+    """Compile an agent's plan for one observation at a time, with its weights, into a file.
+
+    Raises:
+        AgentError: for an agent that does not plan, or whose plan does not compile.
+    """
+    planner = agent.planner
+    if planner is None:
+        raise AgentError("packaged: expected an agent with a planner, got one without.")
+    if reason := planner.why_not_compiled():
+        raise AgentError(f"packaged: expected a plan that compiles, but {reason}.")
+    _, arguments, _ = planner.example_call(agent.example())
+    with torch.no_grad():
+        program = torch.export.export(_Plan(planner, arguments), _tensors(arguments))
+        torch._inductor.aoti_compile_and_package(program, package_path=str(path))
+
+
+def use_package(agent: Agent, path: Path) -> None:
+    """Plan by a package from now on, after it has found what the eager plan finds.
+
+    Raises:
+        AgentError: if it finds another plan.
+    """
+    planner = agent.planner
+    assert planner is not None
+    key, arguments, eager = planner.example_call(agent.example())
+    loaded = torch._inductor.aoti_load_package(str(path))
+    _, spec = pytree.tree_flatten(eager)
+
+    def plan(*args: Any) -> Any:
+        return pytree.tree_unflatten(list(loaded(*_tensors(args))), spec)
+
+    with torch.no_grad():
+        found = plan(*arguments)
+    alike = torch.isclose(found.score, eager.score, rtol=_TOLERANCE, atol=_TOLERANCE)
+    if found.actions.shape != eager.actions.shape or not alike.all():
+        raise AgentError(
+            f"{path}: expected the plan of this agent, of score {eager.score.tolist()}, got one of "
+            f"{found.score.tolist()}."
+        )
+    planner.replace_plan(key, plan)
+
+
+def describe(path: Path, identity: str) -> None:
+    """Write what the package is for, as JSON beside it."""
+    told = {"format": _FORMAT, "sha256": _digest(path), **_here(identity)}
+    _description(path).write_text(json.dumps(told, indent=2) + "\n")
+
+
+def check_package(path: Path, identity: str) -> None:
+    """Refuse a package that was changed, or made for another agent, torch or processor.
+
+    Raises:
+        AgentError: naming what differs.
+    """
+    if not path.is_file():
+        raise AgentError(
+            f"{path}: expected a packaged plan, found none; "
+            "save_agent(agent, directory, packaged=True) writes one."
+        )
+    told, again = read_json(_description(path)), "package the agent again on this machine."
+    for name, here in {"format": _FORMAT, **_here(identity), "sha256": _digest(path)}.items():
+        known = told.get(name)
+        if name == "processor":
+            if missing := sorted(set(known or ()) - set(here)):
+                raise AgentError(f"{path}: this processor lacks {', '.join(missing)}; {again}")
+        elif known != here:
+            raise AgentError(f"{path}: expected {name} {here!r}, got {known!r}; {again}")
+
+
+def identify(content: Mapping[str, Any]) -> str:
+    """A digest of all of an agent's file that a plan depends on, its weights' among it."""
+    plain = {key: value for key, value in content.items() if key != "metadata"}
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def _here(identity: str) -> dict[str, Any]:
+    return {
+        "agent_sha256": identity,
+        "package_version": package_version(),
+        "torch_version": torch_version(),
+        "platform": platform_name(),
+        "processor": list(processor()),
+    }
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _description(path: Path) -> Path:
+    return path.with_name(f"{path.name}.json")
+
+
+def _tensors(arguments: Any) -> tuple[Tensor, ...]:
+    return tuple(leaf for leaf in pytree.tree_leaves(arguments) if isinstance(leaf, Tensor))

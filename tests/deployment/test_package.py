@@ -1,0 +1,201 @@
+"""A packaged plan is taken only where asked for, and where it is what it claims to be."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, save_agent
+from phihp_torchrl.agents import Actor, TwinQ
+from phihp_torchrl.deployment import AgentError, package
+from phihp_torchrl.planners import CEMConfig
+
+CONFIG = CEMConfig(
+    planning_horizon=2, num_candidates=8, top_k=3, num_policy_candidates=2, warm_start=True
+)
+
+
+def make(**changes):
+    torch.manual_seed(0)
+    task = get_task("pendulum")
+    parts = {"actor": Actor(task, (8,)), "qvalue": TwinQ(task, (8,)), "planner_config": CONFIG}
+    return Agent(task, **{"dynamics": HybridDynamics.hybrid(task), **parts, **changes})
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """An agent with a package, which is a text here, and the exported program that it stands for.
+
+    Exporting takes seconds, so it is done once.
+    """
+    programs, directory = {}, tmp_path_factory.mktemp("saved")
+
+    def compile_and_package(program, package_path):
+        Path(package_path).write_text("a package")
+        programs["a package"] = program.module()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch._inductor, "aoti_compile_and_package", compile_and_package)
+        save_agent(make(), directory, packaged=True)
+    return directory, programs["a package"]
+
+
+@pytest.fixture
+def directory(saved, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch._inductor, "aoti_load_package", lambda path: saved[1])
+    return Path(shutil.copytree(saved[0], tmp_path / "agent"))
+
+
+def seen(agent, seed=0):
+    torch.manual_seed(seed)
+    state = agent.task.reset.sample([])
+    return TensorDict(observation=agent.task.observe(state), is_init=torch.tensor([True]))
+
+
+def act(agent, seed=1):
+    agent.reset()
+    data = seen(agent)
+    torch.manual_seed(seed)
+    return agent(data)["action"]
+
+
+def ours(caplog):
+    return [r.getMessage() for r in caplog.records if r.name.startswith("phihp_torchrl")]
+
+
+def test_a_packaged_plan_is_the_eager_one(directory, caplog):
+    eager, packaged = load_agent(directory), load_agent(directory, packaged=True)
+    assert not ours(caplog)
+    calls = []
+    (key,) = packaged.planner._planning_functions
+    used = packaged.planner._planning_functions[key]
+    packaged.planner.replace_plan(key, lambda *args: (calls.append(0), used(*args))[1])
+    for seed in range(3):
+        torch.testing.assert_close(act(packaged, seed), act(eager, seed), atol=1e-4, rtol=1e-4)
+    assert calls == [0] * 3
+
+
+def test_nothing_native_is_loaded_unless_asked(directory, monkeypatch):
+    def refuse(path):
+        raise AssertionError("native code was loaded")
+
+    monkeypatch.setattr(torch._inductor, "aoti_load_package", refuse)
+    assert act(load_agent(directory)).isfinite().all()
+
+
+def test_a_package_of_another_agent_is_refused(directory, caplog):
+    other = make()
+    with torch.no_grad():
+        other.actor.module.mlp[0].bias.add_(0.1)
+    save_agent(other, directory)
+    agent = load_agent(directory, packaged=True)
+    (said,) = ours(caplog)
+    assert said.startswith("The agent plans eagerly")
+    assert "agent_sha256" in said
+    assert act(agent).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("torch_version", "1.0"), ("platform", "Plan9"), ("processor", ["avx99"]), ("format", "x")],
+)
+def test_a_package_for_elsewhere_is_refused(directory, caplog, key, value):
+    place = directory / f"{package.PACKAGE_FILE}.json"
+    place.write_text(json.dumps({**json.loads(place.read_text()), key: value}))
+    load_agent(directory, packaged=True)
+    (said,) = ours(caplog)
+    assert "package the agent again on this machine" in said
+    assert key in said
+
+
+def test_a_changed_or_missing_package_is_refused(directory, caplog):
+    place = directory / package.PACKAGE_FILE
+    place.write_text(place.read_text() + " ")
+    load_agent(directory, packaged=True)
+    place.unlink()
+    load_agent(directory, packaged=True)
+    changed, missing = ours(caplog)
+    assert "expected sha256" in changed
+    assert "expected a packaged plan, found none" in missing
+
+
+def test_a_package_that_finds_another_plan_is_refused(directory, saved, caplog, monkeypatch):
+    def off(*args):
+        return [10.0 + each for each in saved[1](*args)]
+
+    monkeypatch.setattr(torch._inductor, "aoti_load_package", lambda path: off)
+    load_agent(directory, packaged=True)
+    assert "expected the plan of this agent" in ours(caplog)[0]
+
+
+def test_what_has_no_plan_has_no_package(tmp_path, caplog):
+    alone = make(planner_config=None)
+    with pytest.raises(AgentError, match="packaged: expected an agent with a planner"):
+        save_agent(alone, tmp_path, packaged=True)
+    save_agent(alone, tmp_path)
+    load_agent(tmp_path, packaged=True)
+    assert "expected an agent that plans" in caplog.text
+    with pytest.raises(AgentError, match="without compile, got both"):
+        load_agent(tmp_path, packaged=True, compile=True)
+
+
+def test_an_adaptive_integrator_has_no_package(tmp_path):
+    agent = make(dynamics=HybridDynamics.hybrid(get_task("pendulum"), integrator="dopri5"))
+    with pytest.raises(AgentError, match="integrator does not compile"):
+        save_agent(agent, tmp_path, packaged=True)
+
+
+def test_warm_up_compiles_in_the_foreground():
+    agent = make()
+    agent.planner._compile = {"backend": "eager"}
+    expected = act(agent)
+    state = torch.get_rng_state()
+    found = agent.warm_up()
+    assert found.ready
+    assert found.compiled
+    assert torch.equal(torch.get_rng_state(), state)
+    torch.testing.assert_close(act(agent), expected)
+    assert not make(planner_config=None).warm_up().compiled
+
+
+def test_warm_up_says_what_does_not_compile(caplog):
+    agent = make(dynamics=HybridDynamics.hybrid(get_task("pendulum"), integrator="dopri5"))
+    with caplog.at_level(logging.WARNING):
+        assert not agent.warm_up(background=True).compiled
+    assert "integrator does not compile" in caplog.text
+
+
+def test_warm_up_says_what_another_process_cannot_be_given(caplog):
+    agent = make()
+    agent.metadata["function"] = lambda: None
+    found = agent.warm_up(background=True)
+    assert found.ready
+    assert "another process cannot be given the agent" in caplog.text
+
+
+def test_an_agent_stays_eager_where_the_other_process_fails(monkeypatch, caplog):
+    monkeypatch.setattr("phihp_torchrl.deployment.warm_up._CHILD", "raise SystemExit('no room')")
+    agent = make()
+    expected = act(agent)
+    assert not agent.warm_up(background=True).wait(60)
+    assert "stays eager: no room" in caplog.text
+    torch.testing.assert_close(act(agent), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_another_process_compiles_the_plan():
+    agent = make()
+    expected = act(agent)
+    found = agent.warm_up(background=True)
+    torch.testing.assert_close(act(agent), expected)  # eagerly, in the meantime
+    with pytest.raises(TimeoutError, match="still compiling"):
+        found.wait(0.01)
+    assert found.wait(500)
+    torch.testing.assert_close(act(agent), expected, atol=1e-4, rtol=1e-4)
