@@ -116,7 +116,10 @@ def parts(config: RunConfig, place: Path, kills: int, flips: int) -> Iterator[di
     killed: dict[str, Counter[str]] = {kind: Counter() for kind in (AT_RANDOM, BEFORE_OPERATION)}
     for number in range(kills):
         step = 1 + number * operations // kills
-        harms = {AT_RANDOM: {"after": draw.uniform(0, seconds)}, BEFORE_OPERATION: {"step": step}}
+        harms: dict[str, dict[str, Any]] = {
+            AT_RANDOM: {"after": draw.uniform(0, seconds)},
+            BEFORE_OPERATION: {"step": step},
+        }
         for kind, harm in harms.items():
             killed[kind][survives(config, place / "killed", expected, **harm)] += 1
             shutil.rmtree(place / "killed", ignore_errors=True)

@@ -275,7 +275,7 @@ class SamplingPlanner(MPCPlannerBase):
         """Compile the plan for observations of this batch size, and plan by that from now on."""
         key, args, _ = self.example_call(tensordict)
         function = self._build(compiled=True)
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        with torch.no_grad(), deterministic():
             function(*args)
         self.replace_plan(key, function)
 
