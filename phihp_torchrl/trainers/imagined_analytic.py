@@ -7,7 +7,7 @@ import logging
 import torch
 from torch import Tensor
 
-from phihp_torchrl.agents import AnalyticUpdate, Draws, learning_rate_scale, make_td3_loss
+from phihp_torchrl.agents import AnalyticUpdate, Draws, make_td3_loss
 from phihp_torchrl.imagination import Worlds
 from phihp_torchrl.trainers.learners import Imagination, register_learner
 from phihp_torchrl.trainers.replay_base import ReplayTrainer
@@ -38,6 +38,7 @@ class ImaginedAnalytic(ReplayTrainer):
         model, config = imagination.world_model, imagination.config
         super().__init__(model.task, imagination.seed)
         self.config, self.max_age = config, imagination.rollouts.max_age
+        self.schedule = imagination.schedule
         self.start_states = imagination.start_states
         loss = make_td3_loss(model, config.td3)
         self.update = AnalyticUpdate(
@@ -55,7 +56,7 @@ class ImaginedAnalytic(ReplayTrainer):
         """Learn until there are ``until`` critic updates; returns averages of what is logged."""
         found: list[dict[str, Tensor]] = []
         while self.updates < until:
-            scale = learning_rate_scale(1.0 - self.updates / self.config.updates, self.config.decay)
+            scale = self.schedule.scale(self.updates)
             draws = self._draw(scale)
             batch, state, metrics = self.update(self.worlds.state, draws, scale)
             self.replay.extend(batch)

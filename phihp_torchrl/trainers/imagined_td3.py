@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from phihp_torchrl.agents import learning_rate_scale
 from phihp_torchrl.trainers.learners import Imagination, register_learner
 from phihp_torchrl.trainers.td3_base import TD3Trainer
 
@@ -21,6 +20,7 @@ class ImaginedTD3(TD3Trainer):
 
     def __init__(self, imagination: Imagination) -> None:
         config = self.config = imagination.config
+        self.schedule = imagination.schedule
         self.rollouts, self.start_states = imagination.rollouts, imagination.start_states
         super().__init__(
             imagination.world_model, config.td3, seed=imagination.seed, compile=imagination.compile
@@ -43,8 +43,7 @@ class ImaginedTD3(TD3Trainer):
                 self._imagine_chunk()
             for _ in range(min(round_end - self.updates % round_end, until - self.updates)):
                 if self.updates % config.td3.policy_delay == 0:
-                    left = 1.0 - self.updates / config.updates
-                    scale = learning_rate_scale(left, config.decay)
+                    scale = self.schedule.scale(self.updates)
                     losses = self._learn(config.batch_size, scale)
                 self.updates += 1
         return losses

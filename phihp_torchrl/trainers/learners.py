@@ -13,6 +13,7 @@ from phihp_torchrl.agents import ActorCriticUpdate, FlatReplay
 from phihp_torchrl.config import Registry
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Rollouts, StartStates, Worlds
+from phihp_torchrl.trainers.plateau import Schedule
 
 
 class Learner(Protocol):
@@ -71,6 +72,7 @@ class Imagination:
         config: settings of the phase, a :class:`~phihp_torchrl.trainers.PolicyConfig`.
         seed: seed of all random numbers but the initial weights of the networks.
         compile: whether to compile updates.
+        schedule: the factor on learning rates, by the updates so far; it may fall early.
     """
 
     world_model: TaskWorldModel
@@ -79,6 +81,7 @@ class Imagination:
     config: Any
     seed: int
     compile: bool
+    schedule: Schedule
 
     def new_replay(self) -> FlatReplay:
         """An empty replay of the size that the settings say."""

@@ -24,7 +24,9 @@ from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel, per_life
 from phihp_torchrl.imagination import Rollouts, make_start_states
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.drawn_constants import draw_constants
+from phihp_torchrl.trainers.floor import Floor
 from phihp_torchrl.trainers.learners import LEARNERS, Imagination
+from phihp_torchrl.trainers.plateau import Plateau, Schedule
 from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.policy_evaluation import ActorEvaluation
 from phihp_torchrl.trainers.policy_scales import check_scales, training_scales
@@ -108,11 +110,20 @@ class PolicyTrainer:
         self.scales = training_scales(model, start_states, config, seed)
         self.world_model = scaled(model, self.scales)
         self.rollouts = Rollouts(self.world_model, act, self.max_age, compile=compile)
+        self.schedule = Schedule(config.updates, config.decay)
         self.refit = CriticRefit(
             self.world_model, self.rollouts, config.refit, config.td3.gamma, compile=compile
         )
         self.learner = LEARNERS.find(config.method).build(
-            Imagination(self.world_model, self.rollouts, start_states, config, seed, compile)
+            Imagination(
+                self.world_model,
+                self.rollouts,
+                start_states,
+                config,
+                seed,
+                compile,
+                self.schedule,
+            )
         )
         self.best = [layer.clone() for layer in self._layers()]
         self.best_return = -math.inf
@@ -126,6 +137,16 @@ class PolicyTrainer:
             generator=self.learner.generator,
             compile=compile,
         )
+        self.plateau = None
+        if config.patience:
+            starts, steps = self.evaluation.states, self.evaluation.steps
+            self.plateau = Plateau(
+                self.schedule,
+                config.patience,
+                config.tail,
+                round_to=config.evaluation_interval,
+                floor=lambda: Floor(self.world_model, starts, steps, seed=seed),
+            )
 
     @property
     def max_age(self) -> int:
@@ -144,22 +165,26 @@ class PolicyTrainer:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Critic updates so far and in all."""
-        return self.updates, self.config.updates
+        """Critic updates so far and in all, which a plateau makes fewer."""
+        return self.updates, self.schedule.end
 
     @property
     def done(self) -> bool:
-        """Whether the budget of updates or seconds is spent."""
+        """Whether the budget of updates or seconds is spent, or a plateau has ended learning."""
         limit = self.config.max_seconds
-        return self.updates >= self.config.updates or (limit is not None and self.seconds > limit)
+        return self.updates >= self.schedule.end or (limit is not None and self.seconds > limit)
 
     @torch.no_grad()
     def advance(self) -> dict[str, float]:
         """Train for one evaluation interval and evaluate; returns what to log."""
         start = time.perf_counter()
         config = self.config
-        found = self.learner.learn(min(self.updates + config.evaluation_interval, config.updates))
-        imagined = self.evaluation.imagined(self.update.networks.actor)
+        if self.plateau is not None and self.updates == 0:
+            self.plateau.see(0, self.evaluation.imagined(self.update.networks.actor))
+        end = min(self.updates + config.evaluation_interval, self.schedule.end)
+        found = self.learner.learn(end)
+        returns = self.evaluation.imagined(self.update.networks.actor)
+        imagined = self.evaluation.mean(returns)
         # Of equal ones the later, which has learned more; none that left the finite numbers.
         if -math.inf < imagined >= self.best_return:
             self.best_return = imagined
@@ -175,7 +200,10 @@ class PolicyTrainer:
                 for name, value in found.items()
             },
         }
-        if config.refit.is_due(self.updates, config.updates):
+        if self.plateau is not None:
+            self.plateau.see(self.updates, returns)
+            metrics["policy/end"] = float(self.schedule.end)
+        if config.refit.is_due(self.updates, self.schedule.end):
             metrics |= self._refit_critics()
         metrics |= self.evaluation.real(self.update.networks.actor)
         self.seconds += time.perf_counter() - start
@@ -214,6 +242,7 @@ class PolicyTrainer:
             "evaluation_states": self.evaluation.states,
             "world_states": self.evaluation.world_states,
             **({} if self.shifts is None else {"shifts": self.shifts}),
+            **({} if self.plateau is None else {"plateau": self.plateau.state_dict()}),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -229,6 +258,8 @@ class PolicyTrainer:
             kept.copy_(layer)
         if self.shifts is not None:
             self.shifts.copy_(state["shifts"])  # the same to the last digit on another machine
+        if self.plateau is not None and "plateau" in state:  # older checkpoints go to their end
+            self.plateau.load_state_dict(state["plateau"])
         self.best_return = state["best_return"]
         self.evaluation.states = state["evaluation_states"]
         self.evaluation.world_states = state["world_states"]

@@ -47,6 +47,9 @@ class PolicyConfig:
         max_age: steps after which an imagined episode is truncated, or their duration, such as
             "6 s"; null for the task's limit.
         decay: share of the updates, at the end, over which learning rates fall to a twentieth.
+        patience: share of the updates for which the imagined return may stand still before learning
+            rates fall and learning ends; 0 for learning to the end.
+        tail: share of the updates over which learning rates then fall.
         evaluation_interval: updates between two evaluations in the model, which choose the actor to
             keep.
         evaluation_episodes: imagined episodes in an evaluation.
@@ -90,6 +93,8 @@ class PolicyConfig:
     random_fraction: float = 0.1
     max_age: Steps | None = None
     decay: float = 0.5
+    patience: float = 0.0
+    tail: float = 0.1
     evaluation_interval: int = 500
     evaluation_episodes: int = 64
     evaluation_steps: Steps | None = None
@@ -124,7 +129,7 @@ class PolicyConfig:
         check_choice(self, "scales", ("auto", "none"))
         if isinstance(self.strategies, str):
             check_choice(self, "strategies", ("auto", "none"))
-        check_share(self, "random_fraction", "decay")
+        check_share(self, "random_fraction", "decay", "patience", "tail")
         check_count(self, "random_steps", "real_evaluation_episodes", least=0)
         check_not_negative(self, "exploration_noise")
         if self.random_steps > self.replay_capacity:

@@ -57,16 +57,20 @@ class ActorEvaluation:
         )
         self.world_signals = self._draw_signals(task, config.real_evaluation_episodes, seed)
 
-    def imagined(self, actor: Layers) -> float:
-        """Mean return in the model; minus infinity where the actor left the finite numbers."""
+    def imagined(self, actor: Layers) -> Tensor:
+        """Returns in the model ``[N]``; minus infinity where the actor left the finite numbers."""
         return self._play(self.rollouts, actor, self.states, self.signals)
 
     def real(self, actor: Layers) -> dict[str, float]:
         """Mean return in the simulated world, to log; nothing without one."""
         if self.world is None:
             return {}
-        score = self._play(self.world, actor, self.world_states, self.world_signals)
-        return {"policy/real_return": score}
+        returns = self._play(self.world, actor, self.world_states, self.world_signals)
+        return {"policy/real_return": self.mean(returns)}
+
+    def mean(self, returns: Tensor) -> float:
+        """Their mean in physical units."""
+        return self.scales.reward * returns.mean().item()
 
     def _draw_signals(self, task: Task, episodes: int, seed: int) -> Tensor | None:
         """References and inputs of episodes, ``[1 + steps, episodes, size]``, if there are any."""
@@ -78,10 +82,10 @@ class ActorEvaluation:
 
     def _play(
         self, world: Rollouts, actor: Layers, states: Tensor, signals: Tensor | None
-    ) -> float:
+    ) -> Tensor:
         later = None
         if signals is not None:
             states, later = world.task.with_signals(states, signals[0]), signals[1:]
         score = world.returns(actor, states, self.steps, signals=later).total
         # Neither NaN nor an infinite return may win.
-        return self.scales.reward * torch.where(score.isfinite(), score, -math.inf).mean().item()
+        return torch.where(score.isfinite(), score, -math.inf)
