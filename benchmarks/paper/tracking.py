@@ -25,7 +25,7 @@ from scipy.optimize import minimize
 from tensordict import TensorDict
 from torch import Tensor
 
-from phihp_torchrl import Task, get_task, learn
+from phihp_torchrl import Agent, Task, get_task, learn, load_agent, save_agent
 from phihp_torchrl.evaluation import EVALUATION_SEED, markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
 from phihp_torchrl.trainers import import_plugins
@@ -46,6 +46,7 @@ SETTINGS = {
     "model.real_steps": 1000,
     "model.steps_per_iteration": 500,
     "policy.evaluation_steps": 250,
+    "policy.strategies": "none",
     "policy.real_evaluation_episodes": 0,
     "policy.refit.start": 0,
     "evaluate.episodes": 2,
@@ -54,7 +55,7 @@ SETTINGS = {
     "progress": False,
     "compile": False,
 }
-"""What differs from the defaults: a small budget, and no pictures."""
+"""What differs from the defaults: a small budget, one way to learn, and no pictures."""
 
 Policy = Callable[[TensorDict], TensorDict]
 
@@ -182,13 +183,17 @@ def measure(policy: Policy, task: Task, episodes: int) -> dict[str, dict[str, fl
     return found
 
 
-def train(name: str, seed: int, updates: int) -> tuple[Any, float]:
-    """Learn, with the settings above; returns the agent and seconds."""
-    settings = {**SETTINGS, "seed": seed, "policy.updates": updates}
-    begun = time.perf_counter()
-    with tempfile.TemporaryDirectory() as place:
-        agent = learn(name, overrides=settings, run_dir=f"{place}/run").agent
-    return agent, time.perf_counter() - begun
+def train(name: str, seed: int, updates: int, place: Path) -> Agent:
+    """The agent in ``place``, which is learned with the settings above if it is not there."""
+    directory = place / f"{name}-{seed}-{updates}"
+    if not directory.exists():
+        settings = {**SETTINGS, "seed": seed, "policy.updates": updates}
+        begun = time.perf_counter()
+        with tempfile.TemporaryDirectory() as run:
+            agent = learn(name, overrides=settings, run_dir=f"{run}/run").agent
+        agent.metadata["seconds"] = time.perf_counter() - begun
+        save_agent(agent, directory)
+    return load_agent(directory, task=get_task(name))
 
 
 def write(result: Mapping[str, Any], results: Path) -> None:
