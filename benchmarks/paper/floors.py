@@ -4,9 +4,10 @@
 
 The policy phase tries another strategy where its best actor is at the floor from more than 15 % of
 the starts at the end of a way to learn, or from 90 % half-way (``docs/imagination.md``). Here the
-same measure is taken, in the models of results/agents, of actors without any training, of full
-actions that never change, and of the agents' own actors. The thresholds have to lie between the
-first two and the last. Writes results/floors/.
+same measure is taken, in the models of results/agents, of actors without any training, and of the
+agents' own. The thresholds have to lie between the two. A full action that never changes is played
+as well: where it alone moves a system, it is above the floor, and is told from skill by nothing
+here. Writes results/floors/.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from phihp_torchrl.trainers import import_plugins
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 RIGS = Path(__file__).parent / "rigs"
-RESULTS = Path("results/tracking")
+RESULTS, AGENTS = Path("results/tracking"), Path("outputs/tracking")
 TASKS = ("motor", "motor-preview")
 TUNING_SEED = 0
 STEADY_STEPS = 150
@@ -56,6 +57,16 @@ SETTINGS = {
     "compile": False,
 }
 """What differs from the defaults: a small budget, one way to learn, and no pictures."""
+
+SETTLED = {
+    "warm_start": True,
+    "keep_incumbent": True,
+    "num_kept_elites": 2,
+    "init_std": 0.3,
+}
+"""A search that settles: it goes on from its last plan, which it keeps unless another is better.
+
+Chosen by ``tracking_search.py`` with episodes of a training seed."""
 
 Policy = Callable[[TensorDict], TensorDict]
 
@@ -191,9 +202,12 @@ def train(name: str, seed: int, updates: int, place: Path) -> Agent:
         begun = time.perf_counter()
         with tempfile.TemporaryDirectory() as run:
             agent = learn(name, overrides=settings, run_dir=f"{run}/run").agent
-        agent.metadata["seconds"] = time.perf_counter() - begun
+        agent.metadata |= {"seconds": time.perf_counter() - begun, "tracking": SETTINGS}
         save_agent(agent, directory)
-    return load_agent(directory, task=get_task(name))
+    kept = load_agent(directory, task=get_task(name))
+    if kept.metadata.get("tracking") != SETTINGS:
+        raise ValueError(f"{directory}: learned with other settings; remove it to learn again.")
+    return kept
 
 
 def write(result: Mapping[str, Any], results: Path) -> None:
@@ -242,6 +256,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--updates", type=int, default=2500)
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--agents", type=Path, default=AGENTS, help="where agents are kept")
     arguments = parser.parse_args(words)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
@@ -265,19 +280,23 @@ def main(words: Sequence[str] | None = None) -> None:
     )
     for seed in arguments.seeds:
         for name in arguments.tasks:
-            agent, seconds = train(name, seed, arguments.updates)
-            task = get_task(name)
+            agent = train(name, seed, arguments.updates, arguments.agents)
+            task, config = get_task(name), agent.planner_config
+            assert config is not None
+            settled = agent.with_planner(replace(config, **SETTLED))
             measured = {
                 f"planner, seed {seed}": measure(agent, task, episodes),
+                f"planner that settles, seed {seed}": measure(settled, task, episodes),
                 f"actor, seed {seed}": measure(agent.actor_alone(), task, episodes),
             }
             write(
                 {
                     "task": name,
                     "seed": seed,
-                    "seconds": seconds,
+                    "seconds": agent.metadata["seconds"],
                     "updates": arguments.updates,
                     "settings": SETTINGS,
+                    "settled": SETTLED,
                     "episodes": episodes,
                     "measured": measured,
                     "origin": describe_origin(seed),

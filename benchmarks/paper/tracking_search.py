@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tracking import RIGS, play, rms
 
 from phihp_torchrl import Agent, get_task
 from phihp_torchrl.evaluation import markdown_table
@@ -24,6 +23,7 @@ from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.trainers import import_plugins
 from phihp_torchrl.worlds import SimulatedWorld
+from tracking import RIGS, play, rms
 
 RESULTS, SEED, STEPS = Path("results/tracking_search"), 1, 75
 _WARM = {"warm_start": True}
@@ -86,11 +86,11 @@ def write(found: Mapping[str, Any], results: Path) -> None:
     lines = "".join(f"- {name}: {error:.2f}\n" for name, error in found["moving"].items())
     (results / "README.md").write_text(
         "# What of a tracking error is the search's own\n\n"
-        "Made by `python benchmarks/paper/tracking_search.py`. Do not edit. A motor's speed, planned "
-        "in the true model without a policy and a value, so nothing is learned wrongly and no "
-        f"disturbance is there. All errors in rad/s, of {found['episodes']} episodes of training "
-        "seed "
-        f"{SEED}. Steady errors are of constant references, over the last third of {STEPS} steps.\n\n"
+        "Made by `python benchmarks/paper/tracking_search.py`. Do not edit. A motor's speed, "
+        "planned in the true model without a policy and a value, so nothing is learned wrongly and "
+        f"no disturbance is there. All errors in rad/s, of {found['episodes']} episodes of training "
+        f"seed {SEED}. Steady errors are of constant references, over the last third of {STEPS} "
+        "steps.\n\n"
         f"{table}\nRMS error on random references ({MOVING}):\n\n{lines}\n"
         f"Made at {origin_text(found['origin'])}.\n"
     )
