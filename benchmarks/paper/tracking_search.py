@@ -88,7 +88,7 @@ def write(found: Mapping[str, Any], results: Path) -> None:
         "# What of a tracking error is the search's own\n\n"
         "Made by `python benchmarks/paper/tracking_search.py`. Do not edit. A motor's speed, "
         "planned in the true model without a policy and a value, so nothing is learned wrongly and "
-        f"no disturbance is there. All errors in rad/s, of {found['episodes']} episodes of training "
+        f"no disturbance is there. Errors in rad/s, of {found['episodes']} episodes of training "
         f"seed {SEED}. Steady errors are of constant references, over the last third of {STEPS} "
         "steps.\n\n"
         f"{table}\nRMS error on random references ({MOVING}):\n\n{lines}\n"
