@@ -28,7 +28,7 @@ from phihp_torchrl.trainers.run_config import task_of
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/constraints")
 TASK, STATE, LIMIT = "pendulum", "theta_dot", 5.0
-PRICES = (0.0, 3.0)
+PRICES = (0.0, 0.3, 3.0)
 
 
 def settings(price: float, seed: int, updates: int) -> list[str]:
@@ -116,7 +116,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--prices", type=float, nargs="+", default=list(PRICES))
     parser.add_argument("--seeds", type=int, nargs="+", default=[100])
-    parser.add_argument("--updates", type=int, default=1200)
+    parser.add_argument("--updates", type=int, default=4000)
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args(words)
