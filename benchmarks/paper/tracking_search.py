@@ -4,7 +4,8 @@
 
 ``tracking.py`` measures whole agents. Here the model is the world itself and nothing is learned, so
 that what is left of an error is the search's own. Each row changes the planner's defaults. Episodes
-have a training seed, for settings are chosen from this. Writes results/tracking_search/.
+have a training seed, for settings are chosen from this. Writes results/tracking_search/; what is
+there already is not played again.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +25,10 @@ from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.trainers import import_plugins
 from phihp_torchrl.worlds import SimulatedWorld
-from tracking import RIGS, play, rms
+from tracking import PI, RIGS, play, rms
 
-RESULTS, SEED, STEPS = Path("results/tracking_search"), 1, 75
+RESULTS, TUNED = Path("results/tracking_search"), Path("results/tracking/motor.json")
+SEED, STEPS = 1, 75
 _WARM = {"warm_start": True}
 _KEPT = {**_WARM, "keep_incumbent": True, "num_kept_elites": 2}
 SEARCHES: dict[str, Mapping[str, Any]] = {
@@ -76,9 +79,16 @@ def moving(name: str, episodes: int) -> float:
     return rms(*play(agent, agent.task, {}, episodes=episodes, seed=SEED))
 
 
-def write(found: Mapping[str, Any], results: Path) -> None:
+def by_hand(gains: Mapping[str, float], episodes: int) -> float:
+    """RMS error of a PI controller on the same references."""
+    task = get_task("motor")
+    return rms(*play(PI(task, **gains), task, {}, episodes=episodes, seed=SEED))
+
+
+def write(found: dict[str, Any], results: Path) -> None:
     """Write everything as JSON, and a page."""
     results.mkdir(parents=True, exist_ok=True)
+    found["origin"] = describe_origin(SEED)
     (results / "search.json").write_text(json.dumps(found, indent=1) + "\n")
     keys = ("steady_error", "steady_error_largest", "steady_ripple")
     rows = [[name, *(f"{m[key]:.3f}" for key in keys)] for name, m in found["still"].items()]
@@ -91,7 +101,8 @@ def write(found: Mapping[str, Any], results: Path) -> None:
         f"no disturbance is there. Errors in rad/s, of {found['episodes']} episodes of training "
         f"seed {SEED}. Steady errors are of constant references, over the last third of {STEPS} "
         "steps.\n\n"
-        f"{table}\nRMS error on random references ({MOVING}):\n\n{lines}\n"
+        f"{table}\nRMS errors on random references, of PI controllers tuned by `tracking.py` and of "
+        f"plans ({MOVING}) without and with a preview of five steps:\n\n{lines}\n"
         f"Made at {origin_text(found['origin'])}.\n"
     )
 
@@ -105,17 +116,24 @@ def main(words: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     import_plugins([f"{RIGS / 'motor.py'}"])
-    found: dict[str, Any] = {"episodes": arguments.episodes, "still": {}, "moving": {}}
-    found["origin"] = describe_origin(SEED)
+    path, episodes = arguments.results / "search.json", arguments.episodes
+    found: dict[str, Any] = {"episodes": episodes, "still": {}, "moving": {}}
+    found = json.loads(path.read_text()) if path.is_file() else found
+    if found["episodes"] != episodes:
+        raise ValueError(f"{path}: has {found['episodes']} episodes; remove it to play {episodes}.")
     for name, changes in SEARCHES.items():
-        torch.manual_seed(SEED)
-        found["still"][name] = still(changes, arguments.episodes)
-        write(found, arguments.results)
-        print(name, found["still"][name], flush=True)
-    for name in ("motor", "motor-preview"):
-        found["moving"][name] = moving(name, arguments.episodes)
-        write(found, arguments.results)
-        print(name, found["moving"][name], flush=True)
+        if name not in found["still"]:
+            torch.manual_seed(SEED)
+            found["still"][name] = still(changes, episodes)
+            write(found, arguments.results)
+    gains = json.loads(TUNED.read_text())["gains"]
+    runs = {name: partial(by_hand, each, episodes) for name, each in gains.items()}
+    runs |= {name: partial(moving, name, episodes) for name in ("motor", "motor-preview")}
+    for name, run in runs.items():
+        if name not in found["moving"]:
+            torch.manual_seed(SEED)
+            found["moving"][name] = run()
+            write(found, arguments.results)
 
 
 if __name__ == "__main__":

@@ -144,7 +144,7 @@ def test_strategies_keep_what_reaches_further_already() -> None:
 
 
 def test_starts_go_backwards_from_the_goal_to_the_coverage() -> None:
-    task = get_task("cartpole-swingup")
+    task = replace(get_task("cartpole-swingup"), max_steps=5)
     config = STRATEGIES["backwards"].change(TINY, task)
     trainer = PolicyTrainer(task, HybridDynamics.hybrid(task), config, seed=0)
     widths = []
