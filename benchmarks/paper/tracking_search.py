@@ -101,7 +101,7 @@ def write(found: dict[str, Any], results: Path) -> None:
         f"no disturbance is there. Errors in rad/s, of {found['episodes']} episodes of training "
         f"seed {SEED}. Steady errors are of constant references, over the last third of {STEPS} "
         "steps.\n\n"
-        f"{table}\nRMS errors on random references, of PI controllers tuned by `tracking.py` and of "
+        f"{table}\nRMS errors on random references, of PI controllers (`tracking.py`) and of "
         f"plans ({MOVING}) without and with a preview of five steps:\n\n{lines}\n"
         f"Made at {origin_text(found['origin'])}.\n"
     )
