@@ -9,44 +9,14 @@ command that has come and sends a sample. The agent has three quarters of a tick
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import socket
 import struct
 import time
-from dataclasses import replace
 
 import torch
 
-from phihp_torchrl.deployment import Controller, Safety, load_agent
-from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.deployment import Controller, Safety, load_agent, simulated_plant
 from phihp_torchrl.evaluation import markdown_table
-from phihp_torchrl.tasks import get_task
-from phihp_torchrl.worlds import SimulatedWorld
-
-
-def serve(name: str, rate: float, ticks: int, to: tuple[str, int]) -> None:
-    """Be the plant: send ``(tick, ticks missed so far, time, *observation)``, at last nothing."""
-    torch.set_num_threads(1)
-    task = replace(get_task(name), time_step=1.0 / rate)
-    world = TaskWorldModel(task, SimulatedWorld(task).oracle())
-    state, action = task.sample_start([], torch.Generator().manual_seed(0)), task.bounds.center
-    missed, due = 0, time.monotonic() + 0.1
-    with socket.socket(type=socket.SOCK_DGRAM) as line:
-        line.setblocking(False)
-        for tick in range(ticks):
-            time.sleep(max(0.0, due - time.monotonic()))
-            due, answered = due + 1.0 / rate, -1
-            try:
-                while True:  # until all that has come is read; the newest counts
-                    answered, *command = struct.unpack(f"=i{task.action_dim}f", line.recv(1024))
-                    action = torch.tensor(command)
-            except BlockingIOError:
-                missed += int(answered < tick - 1)
-            with torch.no_grad():
-                state = world.transition(state, action)[0]
-            seen = world.observe(state)[: task.system.observation_dim].tolist()
-            line.sendto(struct.pack(f"=iid{len(seen)}f", tick, missed, time.monotonic(), *seen), to)
-        line.sendto(b"", to)
 
 
 def control(controller: Controller, line: socket.socket) -> tuple[int, int]:
@@ -59,21 +29,6 @@ def control(controller: Controller, line: socket.socket) -> tuple[int, int]:
         action = controller.step(seen, timestamp=stamp)
         line.sendto(struct.pack(f"=i{len(action)}f", tick, *action), heard[1])
     return tick + 1, missed
-
-
-def play(controller: Controller, rate: float, seconds: float) -> tuple[int, int]:
-    """Start a plant, control it, and return its ticks and how many it missed."""
-    with socket.socket(type=socket.SOCK_DGRAM) as line:
-        line.bind(("127.0.0.1", 0))
-        line.settimeout(60.0)  # a process needs a while to start
-        arguments = (controller.task.name, rate, round(rate * seconds), line.getsockname())
-        plant = multiprocessing.get_context("spawn").Process(target=serve, args=arguments)
-        plant.start()
-        try:
-            return control(controller, line)
-        finally:
-            plant.join(5.0)
-            plant.kill()
 
 
 def main() -> None:
@@ -91,7 +46,8 @@ def main() -> None:
             safety = Safety(deadline=0.75 / rate, max_age=0.75 / rate)
             controller = Controller(agent, safety=safety, clock=time.monotonic)
             controller.warm_up()
-            ticks, missed = play(controller, rate, words.seconds)
+            with simulated_plant(agent.task.name, rate, words.seconds) as line:
+                ticks, missed = control(controller, line)
             rows.append([name, f"{rate:g}", f"{missed} of {ticks}", str(controller.report())])
             controller.close()
     print(markdown_table(["agent", "Hz", "missed", "controller"], rows))

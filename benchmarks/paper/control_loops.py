@@ -21,9 +21,9 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "recipes"))
 
-from socket_loop import play
+from socket_loop import control
 
-from phihp_torchrl.deployment import Controller, Safety, load_agent
+from phihp_torchrl.deployment import Controller, Safety, load_agent, simulated_plant
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
 
@@ -40,7 +40,8 @@ def measure(path: Path, acting: str, rates: list[float], seconds: float) -> list
         safety = Safety(deadline=SHARE / rate, max_age=SHARE / rate)
         controller = Controller(agent, safety=safety, clock=time.monotonic)
         controller.warm_up()
-        ticks, missed = play(controller, rate, seconds)
+        with simulated_plant(agent.task.name, rate, seconds) as line:
+            ticks, missed = control(controller, line)
         report, load = controller.report(), os.getloadavg()[0]
         found = {"acting": acting, "hz": rate, "ticks": ticks, "missed": missed, "load": load}
         rows.append({**found, **report.summary(), "reasons": dict(report.reasons)})

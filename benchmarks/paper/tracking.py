@@ -17,6 +17,7 @@ import math
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,14 @@ from scipy.optimize import minimize
 from tensordict import TensorDict
 from torch import Tensor
 
-from phihp_torchrl import Task, get_task, learn
+from phihp_torchrl import Agent, Task, get_task, learn, load_agent, save_agent
 from phihp_torchrl.evaluation import EVALUATION_SEED, markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
 from phihp_torchrl.trainers import import_plugins
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 RIGS = Path(__file__).parent / "rigs"
-RESULTS = Path("results/tracking")
+RESULTS, AGENTS = Path("results/tracking"), Path("outputs/tracking")
 TASKS = ("motor", "motor-preview")
 TUNING_SEED = 0
 STEADY_STEPS = 150
@@ -46,6 +47,7 @@ SETTINGS = {
     "model.real_steps": 1000,
     "model.steps_per_iteration": 500,
     "policy.evaluation_steps": 250,
+    "policy.strategies": "none",
     "policy.real_evaluation_episodes": 0,
     "policy.refit.start": 0,
     "evaluate.episodes": 2,
@@ -54,7 +56,17 @@ SETTINGS = {
     "progress": False,
     "compile": False,
 }
-"""What differs from the defaults: a small budget, and no pictures."""
+"""What differs from the defaults: a small budget, one way to learn, and no pictures."""
+
+SETTLED = {
+    "warm_start": True,
+    "keep_incumbent": True,
+    "num_kept_elites": 2,
+    "init_std": 0.3,
+}
+"""A search that settles: it goes on from its last plan, which it keeps unless another is better.
+
+Chosen by ``tracking_search.py`` with episodes of a training seed."""
 
 Policy = Callable[[TensorDict], TensorDict]
 
@@ -182,13 +194,20 @@ def measure(policy: Policy, task: Task, episodes: int) -> dict[str, dict[str, fl
     return found
 
 
-def train(name: str, seed: int, updates: int) -> tuple[Any, float]:
-    """Learn, with the settings above; returns the agent and seconds."""
-    settings = {**SETTINGS, "seed": seed, "policy.updates": updates}
-    begun = time.perf_counter()
-    with tempfile.TemporaryDirectory() as place:
-        agent = learn(name, overrides=settings, run_dir=f"{place}/run").agent
-    return agent, time.perf_counter() - begun
+def train(name: str, seed: int, updates: int, place: Path) -> Agent:
+    """The agent in ``place``, which is learned with the settings above if it is not there."""
+    directory = place / f"{name}-{seed}-{updates}"
+    if not directory.exists():
+        settings = {**SETTINGS, "seed": seed, "policy.updates": updates}
+        begun = time.perf_counter()
+        with tempfile.TemporaryDirectory() as run:
+            agent = learn(name, overrides=settings, run_dir=f"{run}/run").agent
+        agent.metadata |= {"seconds": time.perf_counter() - begun, "tracking": SETTINGS}
+        save_agent(agent, directory)
+    kept = load_agent(directory, task=get_task(name))
+    if kept.metadata.get("tracking") != SETTINGS:
+        raise ValueError(f"{directory}: learned with other settings; remove it to learn again.")
+    return kept
 
 
 def write(result: Mapping[str, Any], results: Path) -> None:
@@ -237,6 +256,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--updates", type=int, default=2500)
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--agents", type=Path, default=AGENTS, help="where agents are kept")
     arguments = parser.parse_args(words)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
@@ -260,19 +280,23 @@ def main(words: Sequence[str] | None = None) -> None:
     )
     for seed in arguments.seeds:
         for name in arguments.tasks:
-            agent, seconds = train(name, seed, arguments.updates)
-            task = get_task(name)
+            agent = train(name, seed, arguments.updates, arguments.agents)
+            task, config = get_task(name), agent.planner_config
+            assert config is not None
+            settled = agent.with_planner(replace(config, **SETTLED))
             measured = {
                 f"planner, seed {seed}": measure(agent, task, episodes),
+                f"planner that settles, seed {seed}": measure(settled, task, episodes),
                 f"actor, seed {seed}": measure(agent.actor_alone(), task, episodes),
             }
             write(
                 {
                     "task": name,
                     "seed": seed,
-                    "seconds": seconds,
+                    "seconds": agent.metadata["seconds"],
                     "updates": arguments.updates,
                     "settings": SETTINGS,
+                    "settled": SETTLED,
                     "episodes": episodes,
                     "measured": measured,
                     "origin": describe_origin(seed),

@@ -17,6 +17,8 @@ from phihp_torchrl.tasks import Step, Task
 
 Matrix = NDArray[np.float64]
 
+_SECANT = 0.05
+"""Half-ranges to either side of the goal across which slopes of the state are taken."""
 _DRIFT = 0.01
 """The largest motion in one step, in half-ranges of the state, of what counts as a rest."""
 _SAMPLES = 512
@@ -83,7 +85,7 @@ def linearise(
     *,
     registers: bool = True,
 ) -> LinearModel:
-    """The linear model of one step at the goal, by forward differentiation of the model.
+    """The linear model of one step at the goal, by differentiating the model.
 
     Args:
         task: the task.
@@ -109,10 +111,29 @@ def linearise(
         at = torch.cat([state, task.registers.rest(action)])
         move = _with_registers(task, step)
     with torch.no_grad():
-        a, b = (m.detach().numpy() for m in jacfwd(move, (0, 1))(at, action))
+        slope_a, b = (m.detach().numpy() for m in jacfwd(move, (0, 1))(at, action))
+        a = _with_secants(task, move, at, action, slope_a)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise ConfigError("dynamics", "expected finite derivatives at the goal, got others.")
     return LinearModel(task, at, action, a, b)
+
+
+def _with_secants(task: Task, move: Step, at: Tensor, action: Tensor, a: Matrix) -> Matrix:
+    """The slopes of the physical components as secants across a share of their half-ranges.
+
+    A residual that has learned dry friction is steep at rest, as if friction were a strong viscous
+    one; its derivative there says nothing of a system that moves.
+    """
+    ranges, found = half_ranges(task)[0], a.copy()
+    size = len(ranges)
+    for i, reach in enumerate(_SECANT * ranges):
+        shift = torch.zeros_like(at)
+        shift[i] = reach
+        ahead, behind = move(at + shift, action), move(at - shift, action)
+        change = ahead - behind
+        change[:size] = task.system.difference(ahead[:size], behind[:size])
+        found[:, i] = (change / (2.0 * reach)).numpy()
+    return found
 
 
 def _with_registers(task: Task, step: Step) -> Step:

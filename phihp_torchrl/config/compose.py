@@ -34,7 +34,7 @@ PLACES = ("run_dir", "resume", "trust")
 _GROUPS = ("preset", "task", "method", "budget", "logger", "world", "planner")
 _NAMES = ("task", "preset", "method")
 # Settings that are mappings with names of a user's choice, or that change something by name.
-_MAPPINGS = ("actuator", r"world\.(?:actuator|friction|constants|noise|columns)")
+_MAPPINGS = ("actuator", "constraints", r"world\.(?:actuator|friction|constants|noise|columns)")
 _FIRST_PLANNER = "cem"  # the kind of planner that a layer's numbers are for if it names none
 
 

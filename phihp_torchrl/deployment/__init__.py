@@ -15,6 +15,7 @@ from phihp_torchrl.deployment.observer import VelocityObserver
 from phihp_torchrl.deployment.reading import AgentError
 from phihp_torchrl.deployment.realtime import RealTimeReport, run_realtime
 from phihp_torchrl.deployment.safety import Safety
+from phihp_torchrl.deployment.socket_plant import simulated_plant
 
 __all__ = [
     "Agent",

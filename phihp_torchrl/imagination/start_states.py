@@ -5,61 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_fields, check_not_negative
-from phihp_torchrl.tasks import Box, Task
-
-
-class StartStates(Protocol):
-    """The interface of everything that draws start states of imagined episodes.
-
-    The states are drawn on the device of the generator (the CPU if there is none) and then moved,
-    so a seed gives the same states on every device.
-
-    Examples:
-        >>> class Zeros:
-        ...     def sample(self, shape, generator=None, device=None):
-        ...         return torch.zeros(*shape, 2, device=device)
-        >>> MixtureStates({Zeros(): 1.0}).sample([3]).abs().max()
-        tensor(0.)
-    """
-
-    def sample(
-        self,
-        shape: Sequence[int],
-        generator: torch.Generator | None = None,
-        device: torch.device | str | None = None,
-    ) -> Tensor:
-        """Draw states ``[*shape, n]``, float32, on ``device``."""
-
-
-class BoxStates:
-    """Start states drawn uniformly from a box.
-
-    Args:
-        box: the box of states.
-
-    Examples:
-        >>> from phihp_torchrl import get_task
-        >>> BoxStates(get_task("pendulum").reset).sample([5]).shape
-        torch.Size([5, 2])
-    """
-
-    def __init__(self, box: Box) -> None:
-        self.box = box
-
-    def sample(
-        self,
-        shape: Sequence[int],
-        generator: torch.Generator | None = None,
-        device: torch.device | str | None = None,
-    ) -> Tensor:
-        states = self.box.sample([*shape], generator=generator, device=_draw_device(generator))
-        return states.to(device)
+from phihp_torchrl.config import ConfigError, check_fields, check_not_negative, check_share
+from phihp_torchrl.imagination.box_states import BoxStates, StartStates, draw_device
+from phihp_torchrl.imagination.growing_states import GrowingStates
+from phihp_torchrl.tasks import Task
 
 
 class TaskStates:
@@ -137,7 +90,7 @@ class DataStates:
         device: torch.device | str | None = None,
     ) -> Tensor:
         rows = torch.randint(
-            len(self.states), [*shape], generator=generator, device=_draw_device(generator)
+            len(self.states), [*shape], generator=generator, device=draw_device(generator)
         )
         return self.states[rows.to(self.states.device)].to(device)
 
@@ -169,6 +122,13 @@ class MixtureStates:
         self.samplers = tuple(positive)
         self.weights = tuple(weight / total for weight in positive.values())
 
+    def grow(self, progress: float) -> None:
+        """Tell samplers that change with training how far it is, in [0, 1]."""
+        for sampler in self.samplers:
+            box = getattr(sampler, "physical", sampler)
+            if isinstance(box, GrowingStates):
+                box.grow(progress)
+
     def sample(
         self,
         shape: Sequence[int],
@@ -178,7 +138,7 @@ class MixtureStates:
         # Every sampler draws every row: that is cheaper than to group the rows by sampler, and a
         # row then does not depend on the choices of other rows.
         draws = torch.stack([s.sample(shape, generator, device) for s in self.samplers])
-        uniform = torch.rand([*shape, 1], generator=generator, device=_draw_device(generator))
+        uniform = torch.rand([*shape, 1], generator=generator, device=draw_device(generator))
         edges = torch.tensor(self.weights[:-1], device=uniform.device).cumsum(0)
         choice = torch.bucketize(uniform, edges, right=True).to(draws.device)
         return draws.gather(0, choice.expand(draws.shape[1:]).unsqueeze(0)).squeeze(0)
@@ -195,9 +155,11 @@ class StartConfig:
         data: share that starts in states of the real data.
         coverage: share that starts anywhere in the task's coverage box.
         goal: share that starts in the box around the task's goal, if it has one.
+        growth: share of the updates after which the box around the goal has grown to the coverage
+            box; 0 leaves it as it is.
 
     Raises:
-        ConfigError: for a share that is negative or not finite.
+        ConfigError: for a share that is negative or not finite, and for a growth beyond 1.
 
     Examples:
         >>> StartConfig(goal=-0.5)
@@ -210,10 +172,12 @@ class StartConfig:
     data: float = 0.0
     coverage: float = 0.6
     goal: float = 0.2
+    growth: float = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
         check_not_negative(self, "reset", "data", "coverage", "goal")
+        check_share(self, "growth")
 
 
 def make_start_states(
@@ -241,10 +205,11 @@ def make_start_states(
             "data", f"expected states to draw from with data={shares.data}, got none."
         )
     boxes = {"reset": task.reset, "coverage": task.coverage, "goal": task.goal}
+    drawn = {name: BoxStates(box) for name, box in boxes.items() if box is not None}
+    if shares.growth and task.goal is not None and task.coverage is not None:
+        drawn["goal"] = GrowingStates(task.goal, task.coverage, shares.growth)
     samplers: dict[str, StartStates] = {
-        k: TaskStates(task, BoxStates(box), under_way=k != "reset")
-        for k, box in boxes.items()
-        if box is not None
+        name: TaskStates(task, box, under_way=name != "reset") for name, box in drawn.items()
     }
     if states is not None:
         samplers["data"] = states if isinstance(states, DataStates) else DataStates(states)
@@ -261,7 +226,3 @@ def make_start_states(
 def _check_weight(name: str, weight: float) -> None:
     if not (math.isfinite(weight) and weight >= 0):
         raise ConfigError(name, f"expected a finite weight of at least 0, got {weight}.")
-
-
-def _draw_device(generator: torch.Generator | None) -> torch.device:
-    return torch.device("cpu") if generator is None else generator.device

@@ -221,6 +221,19 @@ class Task(Steps):
         ours = {} if self.actuator is None else self.actuator.config
         return replace(self, actuator=from_mapping(Actuator, {**ours, **numbers}, "actuator"))
 
+    def with_constraints(self, numbers: Mapping[str, Any]) -> Task:
+        """Return the task with other limits, by name of a state; none change nothing.
+
+        Args:
+            numbers: by name, ``low``, ``high``, ``price`` and ``hard`` as far as they differ from
+                those of a constraint of that name; ``None`` drops it.
+
+        Raises:
+            ConfigError: for a name that is no state's nor a constraint's, and for a key or number
+                that does not fit.
+        """
+        return replace(self, constraints=self.limits.changed(numbers)) if numbers else self
+
     def unpriced(self) -> Task:
         """Return the task as a world plays it: with the same state, and rewards without prices."""
         constraints = self.limits.unpriced()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,6 +13,9 @@ from phihp_torchrl.config import ConfigError
 from phihp_torchrl.systems import System, wrap
 from phihp_torchrl.tasks.box import Box
 from phihp_torchrl.tasks.constraint import Constraint
+
+_NUMBERS = ["low", "high", "price", "hard"]
+"""What settings may say of a constraint."""
 
 
 class Constraints:
@@ -59,6 +63,42 @@ class Constraints:
     def unpriced(self) -> tuple[Constraint, ...]:
         """The same constraints, soft ones only reported."""
         return tuple(replace(c, price=0.0) if c.price else c for c in self.each)
+
+    def changed(self, numbers: Mapping[str, Any]) -> tuple[Constraint, ...]:
+        """The same constraints with other numbers, and more of them, by name; null drops one.
+
+        Args:
+            numbers: by name, ``low``, ``high``, ``price`` and ``hard`` as far as they differ.
+
+        Raises:
+            ConfigError: for a key or a value that is none of a constraint's; it names the key.
+
+        Examples:
+            >>> from phihp_torchrl import get_task
+            >>> limits = get_task("cartpole").limits
+            >>> limits.changed({"x": {"high": 1.0, "price": 5.0}})[0].high
+            1.0
+        """
+        found = {constraint.name: constraint for constraint in self.each}
+        for name, changes in numbers.items():
+            if changes is None:
+                if found.pop(name, None) is None:
+                    raise ConfigError(
+                        f"constraints.{name}",
+                        f"expected one of {list(self.names)} to drop, or limits, got null.",
+                    )
+                continue
+            if not isinstance(changes, Mapping):
+                raise ConfigError(
+                    f"constraints.{name}", f"expected {_NUMBERS} by name, got {changes!r}."
+                )
+            if unknown := [key for key in changes if key not in _NUMBERS]:
+                raise ConfigError(
+                    f"constraints.{name}.{unknown[0]}", f"unknown key; expected one of {_NUMBERS}."
+                )
+            own = found.get(name)
+            found[name] = replace(own, **changes) if own else Constraint(name, **changes)
+        return tuple(found.values())
 
     def violations(self, state: Tensor, command: Tensor | None = None) -> Tensor:
         """How far each is violated after a step, in its physical units, ``[*batch, c]``.

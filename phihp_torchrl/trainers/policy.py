@@ -105,7 +105,8 @@ class PolicyTrainer:
         self.task = task
         self.config = config = resolve_seconds(config, task.time_step)
         self.shifts = draw_constants(dynamics, config, covariance, seed)
-        start_states = make_start_states(task, config.start, states=data_states)
+        self.start_states = make_start_states(task, config.start, states=data_states)
+        start_states = self.start_states
         model = TaskWorldModel(task, per_life(dynamics, self.shifts))
         self.scales = training_scales(model, start_states, config, seed)
         self.world_model = scaled(model, self.scales)
@@ -179,6 +180,7 @@ class PolicyTrainer:
         """Train for one evaluation interval and evaluate; returns what to log."""
         start = time.perf_counter()
         config = self.config
+        self.start_states.grow(self.updates / config.updates)
         if self.plateau is not None and self.updates == 0:
             self.plateau.see(0, self.evaluation.imagined(self.update.networks.actor))
         end = min(self.updates + config.evaluation_interval, self.schedule.end)

@@ -60,6 +60,9 @@ class RunConfig:
             for each; null for the task's own.
         action_rate_cost: price of a change of the action, squared and in half-ranges, where the
             task is imagined; null for the task's own, 0 for none.
+        constraints: limits of states that are kept softly at a price, or hard as the end of an
+            episode, by name of the state: low, high, price, hard; null for a name drops the task's
+            own.
         world: the real world.
         planner: how the agent plans.
         logger: where metrics are logged, besides metrics.csv.
@@ -92,6 +95,7 @@ class RunConfig:
     actuator: Mapping[str, Any] = field(default_factory=dict, hash=False)
     action_rate_limit: float | tuple[float, ...] | None = None
     action_rate_cost: float | None = None
+    constraints: Mapping[str, Any] = field(default_factory=dict, hash=False)
     world: Any = field(default_factory=SimulatedConfig, metadata={"kinds": WORLDS})
     planner: SearchConfig | None = field(default_factory=CEMConfig, metadata={"kinds": PLANNERS})
     logger: LoggerConfig = field(default_factory=LoggerConfig)
@@ -217,7 +221,7 @@ def is_enabled(section: Any) -> bool:
 
 
 def task_of(config: RunConfig, task: Task | None = None) -> Task:
-    """Return the task of a run, with the actuator and the rates that its settings give it.
+    """Return the task of a run, with the actuator, the rates and the constraints of its settings.
 
     Args:
         config: settings of the run.
@@ -241,5 +245,5 @@ def task_of(config: RunConfig, task: Task | None = None) -> Task:
         ) from error
     names = ("action_rate_limit", "action_rate_cost")
     rates = {name: value for name in names if (value := getattr(config, name)) is not None}
-    task = task.with_actuator(config.actuator)
+    task = task.with_actuator(config.actuator).with_constraints(config.constraints)
     return replace(task, **rates) if rates else task

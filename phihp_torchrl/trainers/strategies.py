@@ -17,6 +17,7 @@ AS_SET = "as-set"
 # other swing-ups of 10 to 30 s is found, whatever their time steps.
 _CONSTANT, _LIFE, _EXPANSION = 0.4, 0.6, 0.01
 _MOST_EXPANDED, _LEAST_EXPANDED = 5, 3
+_GROWTH = 0.6  # share of the updates within which starts reach the coverage box
 
 
 @dataclass(frozen=True)
@@ -103,12 +104,54 @@ def start_at_goal(config: PolicyConfig, task: Task) -> PolicyConfig:
     return replace(look_further(config, task), start=start)
 
 
+def start_backwards(config: PolicyConfig, task: Task) -> PolicyConfig:
+    """As :func:`look_further`, with starts near the goal at first and from ever further away.
+
+    Args:
+        config: settings of the phase.
+        task: the task; without a goal box and a coverage box there is no way back from the goal.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> start_backwards(PolicyConfig(), get_task("cartpole-swingup")).start.growth
+        0.6
+    """
+    if task.goal is None or task.coverage is None:
+        return config
+    start = replace(config.start, reset=0.1, coverage=0.0, data=0.0, goal=0.9, growth=_GROWTH)
+    return replace(look_further(config, task), start=start)
+
+
+def learn_by_gradients(config: PolicyConfig, task: Task) -> PolicyConfig:
+    """As :func:`look_further`, by policy gradients through the model where that is smooth.
+
+    Args:
+        config: settings of the phase.
+        task: the task; a model with stops (``position_limits``) is not smooth.
+
+    Examples:
+        >>> from phihp_torchrl import get_task
+        >>> learn_by_gradients(PolicyConfig(), get_task("pendulum")).method
+        'analytic'
+    """
+    if task.position_limits or config.method == "analytic":
+        return config
+    further, analytic = look_further(config, task), config.analytic
+    together = config.num_worlds * analytic.horizon
+    # One actor update has this many of the critics, which has to divide all three.
+    count = math.gcd(analytic.critic_updates, config.updates, config.evaluation_interval, together)
+    analytic = replace(analytic, critic_updates=count)
+    return replace(further, method="analytic", analytic=analytic)
+
+
 STRATEGIES: Registry[Strategy] = Registry("policy.strategies")
 """Strategies by name, in the order in which ``auto`` tries them."""
 
 STRATEGIES.register("further", Strategy("looks further ahead", look_further))
 STRATEGIES.register("goal", Strategy("starts near the goal", start_at_goal))
 STRATEGIES.register("wide", Strategy("starts everywhere", start_wider))
+STRATEGIES.register("backwards", Strategy("starts ever further from the goal", start_backwards))
+STRATEGIES.register("analytic", Strategy("learns by gradients", learn_by_gradients))
 
 
 def strategies_of(config: PolicyConfig) -> tuple[str, ...]:
@@ -119,7 +162,7 @@ def strategies_of(config: PolicyConfig) -> tuple[str, ...]:
 
     Examples:
         >>> strategies_of(PolicyConfig()), strategies_of(PolicyConfig(strategies="none"))
-        (('further', 'goal', 'wide'), ())
+        (('further', 'goal', 'wide', 'backwards', 'analytic'), ())
     """
     asked = config.strategies
     if isinstance(asked, str):

@@ -116,3 +116,17 @@ def test_observations_of_another_size_are_refused() -> None:
         lqr(TensorDict(observation=torch.zeros(2)))
     with pytest.raises(ValueError, match="observation: expected 3 components at the end, got none"):
         lqr(TensorDict())
+
+
+def test_friction_that_is_steep_at_rest_does_not_pass_for_a_viscous_one() -> None:
+    class Rubbed(torch.nn.Module):
+        def forward(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+            rub = 0.01 * (state[..., 1:] / 1e-4).tanh()  # m/s in a step, whose slope at 0 is 100
+            return clean(state, action) - torch.cat([torch.zeros_like(rub), rub], -1)
+
+    task = task_of(Slider())
+    clean = prior_of(task).double()
+    weights = {"state_weights": [1.0, 0.2], "action_weights": [0.1]}
+    ours = LQR.from_model(task, Rubbed(), **weights)
+    free = LQR.from_model(task, clean, **weights)
+    np.testing.assert_allclose(ours.gain, free.gain, rtol=0.2)

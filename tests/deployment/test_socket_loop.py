@@ -17,6 +17,7 @@ import torch
 
 from phihp_torchrl import save_agent
 from phihp_torchrl.deployment import Controller, Safety
+from phihp_torchrl.deployment.socket_plant import serve
 
 from .agent_parts import make_agent
 
@@ -33,7 +34,7 @@ def listen() -> socket.socket:
 
 def plant(line: socket.socket, rate: float, ticks: int) -> threading.Thread:
     arguments = ("pendulum", rate, ticks, line.getsockname())
-    thread = threading.Thread(target=RECIPE["serve"], args=arguments, daemon=True)
+    thread = threading.Thread(target=serve, args=arguments, daemon=True)
     thread.start()
     return thread
 

@@ -58,16 +58,16 @@ def test_a_reward_that_is_never_met_is_said_and_every_strategy_tried(
 ) -> None:
     phase = search(sparse(never))
     rows = run(phase)
-    assert [row["policy/strategy"] for row in rows] == [0, 0, 1, 1, 2, 2]  # each left half-way
-    assert [row["policy/updates"] for row in rows] == [2, 4, 6, 8, 10, 12]
-    assert [row["policy/at_floor"] for row in rows if "policy/at_floor" in row] == [1, 1, 1]
-    assert phase.progress == (12, 16)
-    assert phase.summary["tried"] == ["as-set", "further", "wide"]  # it has no goal box
+    assert [row["policy/strategy"] for row in rows] == [0, 0, 1, 1, 2, 2, 3, 3]  # left half-way
+    assert [row["policy/updates"] for row in rows] == [2, 4, 6, 8, 10, 12, 14, 16]
+    assert [row["policy/at_floor"] for row in rows if "policy/at_floor" in row] == [1, 1, 1, 1]
+    assert phase.progress == (16, 20)
+    assert phase.summary["tried"] == ["as-set", "further", "wide", "analytic"]  # no goal box
     assert phase.summary["at_floor"]
     warnings = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
-    assert len(warnings) == 3
+    assert len(warnings) == 4
     assert "Trying strategy 'further'" in warnings[0]
-    assert "Check that the reward can be reached" in warnings[2]
+    assert "Check that the reward can be reached" in warnings[3]
 
 
 def test_an_actor_above_the_floor_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,6 +141,30 @@ def test_strategies_keep_what_reaches_further_already() -> None:
     changed = STRATEGIES["further"].change(far, task)
     assert changed == far  # so that it is not tried at all
     assert "further" not in dict(search(sparse(never), far).ways)
+
+
+def test_starts_go_backwards_from_the_goal_to_the_coverage() -> None:
+    task = replace(get_task("cartpole-swingup"), max_steps=5)
+    config = STRATEGIES["backwards"].change(TINY, task)
+    trainer = PolicyTrainer(task, HybridDynamics.hybrid(task), config, seed=0)
+    widths = []
+    while not trainer.done:
+        trainer.advance()
+        box = trainer.start_states.samplers[-1].physical.box
+        widths.append(box.high[2] - box.low[2])
+    goal, coverage = task.goal, task.coverage
+    assert widths == sorted(widths)
+    assert widths[0] == pytest.approx(goal.high[2] - goal.low[2])
+    assert widths[-1] == pytest.approx(coverage.high[2] - coverage.low[2])
+    assert STRATEGIES["backwards"].change(TINY, sparse(never)) is TINY  # it has no goal box
+
+
+def test_gradients_are_tried_where_the_model_is_smooth() -> None:
+    task = get_task("cartpole-swingup")
+    config = STRATEGIES["analytic"].change(TINY, task)
+    assert (config.method, config.analytic.critic_updates) == ("analytic", 2)  # every 2 evaluated
+    walled = replace(task, position_limits={"x": (-3.0, 3.0)})
+    assert STRATEGIES["analytic"].change(TINY, walled) is TINY
 
 
 @pytest.mark.parametrize("strategies", ["always", ("further", "sideways")])
