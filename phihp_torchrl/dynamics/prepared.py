@@ -34,6 +34,7 @@ class PreparedModel:
         like: a tensor of the dtype and on the device of the states.
 
     Examples:
+        >>> import torch
         >>> from phihp_torchrl import get_task
         >>> task = get_task("pendulum")
         >>> dynamics = HybridDynamics.hybrid(task)
