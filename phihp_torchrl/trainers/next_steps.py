@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from phihp_torchrl.config import override_lines
+from phihp_torchrl.config import get_method, override_lines
 from phihp_torchrl.trainers.run_directory import RunDirectory
 
 
@@ -17,7 +17,7 @@ def program() -> list[str]:
     """The words that call the command line from here: ``phihp``, or the interpreter's module.
 
     Examples:
-        >>> program()[-1] in ("phihp", "phihp_torchrl")
+        >>> Path(program()[-1]).name in ("phihp", "phihp_torchrl")
         True
     """
     if shutil.which("phihp") is not None:
@@ -36,17 +36,35 @@ def next_steps(path: Path) -> list[tuple[str, str]]:
         path: directory of the run.
 
     Examples:
-        >>> [what for what, _ in next_steps(Path("outputs/a run"))]
-        ['go on to a later phase from it']
+        >>> next_steps(Path("outputs/not-a-run"))
+        []
     """
     directory = RunDirectory(path)
     if not directory.agent.is_dir():
-        return [("go on to a later phase from it", _command(["train"], {"from": str(path)}))]
+        return _later_phases(directory)
     agent = {"agent": str(directory.agent)}
     return [
         ("play it in more episodes", _command(["evaluate"], {**agent, "episodes": 200})),
         ("write it as one file for another machine", _command(["export"], agent)),
     ]
+
+
+def _later_phases(directory: RunDirectory) -> list[tuple[str, str]]:
+    """The command for the phases that a run of the first ones has left."""
+    if not directory.config.is_file():
+        return []
+    config = directory.read_config()
+    names = get_method(config.get("method", "phihp")).phases
+    left = [
+        name
+        for name in names
+        if not directory.phase(name).exists() and (config.get(name) or {}).get("enabled", True)
+    ]
+    if not left or len(left) == len(names):
+        return []
+    settings = {"task": config["task"], "method": config.get("method", "phihp")}
+    command = _command(["train"], {**settings, "phases": left, "from": str(directory.path)})
+    return [("go on to the phases that are left", command)]
 
 
 def resume_command(path: str | Path) -> str:

@@ -28,8 +28,8 @@ _ABOUT_RESULT = (
 )
 _ABOUT_RETURNS = (
     "A point for each collection is what its steps were worth: the mean return of its episodes, "
-    "or the mean reward times the steps of an episode where none was cut short. Those steps serve "
-    "to learn, and not to earn. The agent at the end played episodes of its own."
+    "or the mean reward times the steps of an episode where none was terminated. Those steps "
+    "serve to learn, and not to earn. The agent at the end played episodes of its own."
 )
 _ABOUT_IMAGINED = (
     "Mean return of the noise-free actor after each stretch of training, in the model, and in the "

@@ -86,7 +86,7 @@ def test_metrics(kind):
     trainer = ModelTrainer(SHORT, replace(MODEL, kind=kind), seed=0)
     metrics = trainer.advance()
     assert all(isinstance(value, float) and math.isfinite(value) for value in metrics.values())
-    expected = {"real_steps", "collect/reward"}
+    expected = {"real_steps", "collect/reward", "collect/return"}
     if kind != "oracle":
         names = ("train_error", "held_out_error", "fit_steps", "fit_seconds", "lambda")
         expected |= {f"model/{name}" for name in (*names, "residual_share")}

@@ -107,6 +107,14 @@ def test_the_end_names_table_picture_and_two_commands(
     assert f"train resume={whole}" in capsys.readouterr().out
 
 
+def test_a_run_of_the_first_phase_says_how_to_go_on(copied: Path) -> None:
+    for name in ("agent", "phases/policy", "phases/evaluate"):
+        shutil.rmtree(copied / name)
+    ((_, command),) = next_steps(copied)
+    assert "phases=[policy,evaluate]" in command
+    assert f"from={copied}" in command
+
+
 def test_commands_are_quoted(copied: Path) -> None:
     moved = copied.rename(copied.with_name("my run; rm -rf"))
     assert all("'" in command for _, command in next_steps(moved))
