@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from phihp_torchrl.config import ConfigError, Registry, from_mapping
 from phihp_torchrl.deployment.agent import Agent
+from phihp_torchrl.deployment.defaults import plain_defaults
 from phihp_torchrl.deployment.formats import (
     BOUNDS_OF_VERSION_1,
     FORMAT,
@@ -129,6 +130,7 @@ def save_agent(
     return directory
 
 
+@plain_defaults()
 def load_agent(
     directory: str | os.PathLike[str],
     *,

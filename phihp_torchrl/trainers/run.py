@@ -17,6 +17,7 @@ from torchrl.checkpoint import CheckpointError, GlobalRNGState
 from tqdm.auto import tqdm
 
 from phihp_torchrl.config import ConfigError, resolve_seconds
+from phihp_torchrl.deployment import plain_defaults
 from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.trainers.checkpoints import (
     clear_rotation,
@@ -69,6 +70,7 @@ class _Position:
     seconds: dict[str, float]  # by phase
 
 
+@plain_defaults()
 def run(
     config: RunConfig,
     path: str | Path | None = None,
