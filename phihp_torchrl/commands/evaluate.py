@@ -114,7 +114,9 @@ def play(config: PlayConfig) -> None:
         results[BASELINES_KEY] = beside
     directory = Path(config.out_dir or config.agent)
     directory.mkdir(parents=True, exist_ok=True)
-    (directory / "evaluation.json").write_text(json.dumps(results, indent=2) + "\n")
+    (directory / "evaluation.json").write_text(
+        json.dumps(results, indent=2) + "\n", encoding="utf-8"
+    )
     options = {"world": world, "video": config.video, "seed": config.seed}
     for path in show_episode(shown, directory, **options):  # type: ignore[arg-type]
         print(f"wrote {path}")  # noqa: T201

@@ -42,7 +42,9 @@ class SafeStateAdapter(CheckpointAdapter):
         data = save_tensors(tensors)
         (path / "tensors.safetensors").write_bytes(data)
         digest = hashlib.sha256(data).hexdigest()
-        (path / "tree.json").write_text(json.dumps({"tensors": digest, "tree": tree}))
+        (path / "tree.json").write_text(
+            json.dumps({"tensors": digest, "tree": tree}), encoding="utf-8"
+        )
 
     def load(
         self,
@@ -54,7 +56,7 @@ class SafeStateAdapter(CheckpointAdapter):
         args: tuple[Any, ...],
         kwargs: Mapping[str, Any],
     ) -> Any:
-        record = json.loads((path / "tree.json").read_text())
+        record = json.loads((path / "tree.json").read_text(encoding="utf-8"))
         data = (path / "tensors.safetensors").read_bytes()
         if hashlib.sha256(data).hexdigest() != record["tensors"]:
             raise CheckpointError(

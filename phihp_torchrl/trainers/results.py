@@ -21,7 +21,7 @@ def read_result(path: Path) -> TaskResult | None:
     config = directory.read_config()
     if not directory.evaluation.is_file():
         return None
-    results = json.loads(directory.evaluation.read_text())
+    results = json.loads(directory.evaluation.read_text(encoding="utf-8"))
     results.pop(BASELINES_KEY, None)  # they are not what was learned
     if not results:  # a world in which nobody can act
         return None
@@ -44,6 +44,6 @@ def read_controllers(path: Path) -> dict[str, dict[str, Any]] | None:
     directory = RunDirectory(path)
     if not directory.evaluation.is_file():
         return None
-    results = json.loads(directory.evaluation.read_text())
+    results = json.loads(directory.evaluation.read_text(encoding="utf-8"))
     beside = results.pop(BASELINES_KEY, None)
     return None if beside is None else {**results, **beside}

@@ -78,7 +78,7 @@ class RunDirectory:
     def read_metadata(self) -> dict[str, Any]:
         """Read the metadata; empty if there are none."""
         try:
-            return json.loads(self.metadata.read_text())
+            return json.loads(self.metadata.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return {}
         except ValueError as error:
@@ -119,7 +119,7 @@ def new_run_directory(task: str, label: str) -> Path:
 def write_atomically(path: Path, text: str) -> None:
     """Replace the file at ``path`` in one step: readers see the old text or the new."""
     stage = path.with_name(f".{path.name}.stage")
-    stage.write_text(text)
+    stage.write_text(text, encoding="utf-8")
     os.replace(stage, path)
 
 
@@ -148,7 +148,7 @@ class MetricsTable:
         self._columns: list[str] = []
         kept: list[dict[str, str]] = []
         if rows and path.exists():
-            with path.open(newline="") as file:
+            with path.open(newline="", encoding="utf-8") as file:
                 reader = csv.DictReader(file)
                 kept = [row for _, row in zip(range(rows), reader, strict=False)]
                 # Drop columns of later rows only; they are added again with those rows.
@@ -159,16 +159,16 @@ class MetricsTable:
     def append(self, row: Mapping[str, Any]) -> None:
         """Add a row."""
         if new := [name for name in row if name not in self._columns]:
-            with self.path.open(newline="") as file:
+            with self.path.open(newline="", encoding="utf-8") as file:
                 old = list(csv.DictReader(file))
             self._columns += new
             self._write(old)
-        with self.path.open("a", newline="") as file:
+        with self.path.open("a", newline="", encoding="utf-8") as file:
             csv.DictWriter(file, self._columns, lineterminator="\n").writerow(row)
 
     def _write(self, rows: list[dict[str, str]]) -> None:
         stage = self.path.with_name(f".{self.path.name}.stage")
-        with stage.open("w", newline="") as file:
+        with stage.open("w", newline="", encoding="utf-8") as file:
             if self._columns:
                 writer = csv.DictWriter(
                     file, self._columns, lineterminator="\n", extrasaction="ignore"
