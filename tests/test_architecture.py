@@ -166,3 +166,22 @@ def test_only_commands_print() -> None:
 def test_importing_it_does_not_import_torch(module: str) -> None:
     code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=120).returncode == 0
+
+
+def test_texts_are_read_and_written_in_utf8_whatever_the_locale() -> None:
+    """``read_text``, ``write_text`` and ``open`` of texts name their encoding."""
+    others = ("Image", "h5py", "gzip", "os")  # whose ``open`` is another
+    wrong = []
+    for path in files():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            function = node.func if isinstance(node, ast.Call) else None
+            name = getattr(function, "attr", getattr(function, "id", ""))
+            if name not in ("open", "read_text", "write_text"):
+                continue
+            if getattr(getattr(function, "value", None), "id", "") in others:
+                continue
+            texts = [a.value for a in node.args if isinstance(a, ast.Constant)]
+            binary = any(isinstance(text, str) and "b" in text[:3] for text in texts)
+            if not binary and "encoding" not in [word.arg for word in node.keywords]:
+                wrong.append(f"{named(path)}:{node.lineno}")
+    assert wrong == []

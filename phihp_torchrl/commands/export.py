@@ -154,7 +154,7 @@ def _compiled(source: Path) -> Callable[..., Any] | None:
         subprocess.run(words, check=True)
         function = getattr(ctypes.CDLL(str(library)), f"{source.stem}_act")
     number = ctypes.POINTER(ctypes.c_float)
-    count = int(source.read_text().split("ACTION = ", 1)[1].split(" ", 1)[0])
+    count = int(source.read_text(encoding="utf-8").split("ACTION = ", 1)[1].split(" ", 1)[0])
 
     def act(observation: Any) -> Any:
         action = torch.empty(count, dtype=torch.float32)

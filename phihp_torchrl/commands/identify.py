@@ -72,7 +72,7 @@ def _settings() -> str:
     """The settings of the fit, from the file that mirrors them."""
     import yaml
 
-    text = (YAML / "identify.yaml").read_text()
+    text = (YAML / "identify.yaml").read_text(encoding="utf-8")
     words = sentences(text)
     lines = [""]
     for key, value in flatten(yaml.safe_load(text)).items():

@@ -13,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from torchrl.checkpoint import CheckpointError
 
+from phihp_torchrl.commands.words import file_error
 from phihp_torchrl.config import (
     MODULE,
     ConfigError,
@@ -64,6 +65,8 @@ def job(composed: DictConfig) -> None:
         result = run(request.config, request.path, resume=request.resume)
     except (ConfigError, CheckpointError, NonFiniteError) as error:
         sys.exit(f"error: {error}")
+    except OSError as error:  # a full disk, a directory without permission, ...
+        sys.exit(f"error: {file_error(error)}")
     except KeyboardInterrupt:
         sys.exit(130)
     tell(result)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from phihp_torchrl.commands.words import read_lines
 from phihp_torchrl.config import ConfigError, kind_mapping, load_config, override_lines
-from phihp_torchrl.deployment import Agent, load_agent
+from phihp_torchrl.deployment import Agent, load_agent, plain_defaults
 from phihp_torchrl.tasks import Task, list_tasks, register_task
 from phihp_torchrl.trainers import RunDirectory, read_run_config, resume_command, run, task_of
 from phihp_torchrl.worlds import WORLDS, GivenConfig, World, make_world
@@ -35,6 +35,7 @@ class Learned(NamedTuple):
     path: Path
 
 
+@plain_defaults()
 def learn(
     task: str | Task,
     world: Any = "simulated",

@@ -54,7 +54,8 @@ def listing(config: ListConfig | None = None) -> str:
         },
         "methods (method=...)": {name: method.about for name, method in METHODS.items()},
         "presets (preset=...)": {
-            path.stem: _about(path.read_text()) for path in sorted((YAML / "preset").glob("*.yaml"))
+            path.stem: _about(path.read_text(encoding="utf-8"))
+            for path in sorted((YAML / "preset").glob("*.yaml"))
         },
         "worlds (world=...)": {name: kind.about for name, kind in WORLDS.items()},
         "planners (planner=...)": {name: kind.about for name, kind in PLANNERS.items()},

@@ -54,9 +54,9 @@ def write() -> list[Path]:
     written = []
     for name, text in mirror().items():
         path = YAML / name
-        if not path.is_file() or path.read_text() != text:
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text)
+            path.write_text(text, encoding="utf-8")
             written.append(path)
     return written
 

@@ -57,6 +57,19 @@ def read_lines(words: Sequence[str]) -> dict[str, Override]:
     return lines
 
 
+def file_error(error: OSError) -> str:
+    """An error of the system in words: which file, and why.
+
+    Examples:
+        >>> file_error(OSError(28, "No space left on device", "runs/one/metrics.csv"))
+        'runs/one/metrics.csv: No space left on device'
+        >>> file_error(OSError(27, "File too large"))
+        'a file cannot be written or read: File too large'
+    """
+    place = error.filename or "a file cannot be written or read"
+    return f"{place}: {error.strerror or error}"
+
+
 def help_of(cls: type, usage: str) -> str:
     """Return the text of ``--help``: each setting with its default and a sentence."""
     words = sentences_of(cls)
@@ -78,5 +91,7 @@ def run_command(cls: type[T], words: Sequence[str], usage: str, do: Callable[[T]
         do(read_words(cls, words))
     except ConfigError as error:
         sys.exit(f"error: {error}")
+    except OSError as error:
+        sys.exit(f"error: {file_error(error)}")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -92,8 +92,8 @@ def help_text(overrides: Sequence[str], config_dir: str | Path | None = None) ->
     groups = {"world": settings["world"]["kind"], "logger": settings["logger"]["name"]}
     values: dict[str, Any] = {**flatten(settings), **groups}
     values.setdefault("budget", _chosen("budget", overrides) or "full")
-    words = sentences((YAML / "train.yaml").read_text())
-    words = {**sentences((YAML / "defaults.yaml").read_text()), **words}
+    words = sentences((YAML / "train.yaml").read_text(encoding="utf-8"))
+    words = {**sentences((YAML / "defaults.yaml").read_text(encoding="utf-8")), **words}
     lines = [
         "usage: phihp train [setting=value ...] [--config-dir DIR] [--multirun] [--help]",
         "",
@@ -120,12 +120,14 @@ def settings_text(overrides: Sequence[str], config_dir: str | Path | None = None
         ConfigError: for a word that cannot be read or a name that there is no file of.
     """
     settings = load_config(overrides=overrides, config_dir=config_dir)
-    words = sentences((YAML / "train.yaml").read_text())
-    words |= sentences((YAML / "defaults.yaml").read_text())
+    words = sentences((YAML / "train.yaml").read_text(encoding="utf-8"))
+    words |= sentences((YAML / "defaults.yaml").read_text(encoding="utf-8"))
     for group, key in (("world", "kind"), ("planner", "kind"), ("logger", "name")):
         file = YAML / group / f"{(settings.get(group) or {}).get(key)}.yaml"
         if file.is_file():
-            words |= {f"{group}.{k}": v for k, v in sentences(file.read_text()).items()}
+            words |= {
+                f"{group}.{k}": v for k, v in sentences(file.read_text(encoding="utf-8")).items()
+            }
     path: list[str] = []
     lines = []
     for line in OmegaConf.to_yaml(OmegaConf.create(settings)).splitlines():

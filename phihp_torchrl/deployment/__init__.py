@@ -6,6 +6,7 @@ from phihp_torchrl.deployment.agent import Agent
 from phihp_torchrl.deployment.c_source import export_c
 from phihp_torchrl.deployment.control_report import ControlReport
 from phihp_torchrl.deployment.controller import Controller
+from phihp_torchrl.deployment.defaults import plain_defaults
 from phihp_torchrl.deployment.export import export_aoti, export_onnx, largest_differences
 from phihp_torchrl.deployment.export_modules import ActorModule, PlanModule
 from phihp_torchrl.deployment.exported import ExportedAgent, load_exported

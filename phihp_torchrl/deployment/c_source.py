@@ -96,7 +96,7 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
     main = _MAIN_STEP if task.register_count else _MAIN_ACT
     size = task.system.observation_dim
     parts.append(main.format(name=name, NAME=name.upper(), size=size))
-    path.write_text("\n".join(parts))
+    path.write_text("\n".join(parts), encoding="utf-8")
     return path
 
 

@@ -28,6 +28,7 @@ from phihp_torchrl.config import (
     sealed,
 )
 from phihp_torchrl.deployment.agent import Agent
+from phihp_torchrl.deployment.defaults import plain_defaults
 from phihp_torchrl.deployment.formats import (
     BOUNDS_OF_VERSION_1,
     FORMAT,
@@ -169,6 +170,7 @@ def save_agent(
     return directory
 
 
+@plain_defaults()
 def load_agent(
     directory: str | os.PathLike[str],
     *,

@@ -73,7 +73,7 @@ class Manifest:
 
     def write(self, path: Path) -> None:
         """Write it beside the exported file."""
-        manifest_path(path).write_text(json.dumps(asdict(self), indent=2) + "\n")
+        manifest_path(path).write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
 
     @classmethod
     def read(cls, path: Path) -> Manifest:
@@ -147,7 +147,7 @@ def processor() -> tuple[str, ...]:
     """
     prefixes = ("avx", "fma", "amx", "sse4", "f16c", "bmi", "sve", "asimd")
     try:
-        text = Path("/proc/cpuinfo").read_text()
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         return ()
     for line in text.splitlines():

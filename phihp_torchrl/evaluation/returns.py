@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from phihp_torchrl.config import ConfigError, is_whole
+from phihp_torchrl.deployment import plain_defaults
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
 from phihp_torchrl.evaluation.violations import Violations
@@ -90,6 +91,7 @@ class Evaluation:
         }
 
 
+@plain_defaults()
 def evaluate(
     policy: TensorDictModuleBase,
     task: str | Task,

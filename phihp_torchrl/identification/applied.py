@@ -54,7 +54,7 @@ def _read(path: Path) -> Identification:
     """The parts of a report that a task needs."""
     path = path / "identification.json" if path.is_dir() else path
     try:
-        said = json.loads(path.read_text())
+        said = json.loads(path.read_text(encoding="utf-8"))
         constants = {name: Estimate(**each) for name, each in said["constants"].items()}
         actuator = ActuatorEstimate(**{**said["actuator"], "tried": ()})
         stops = {name: (low, high) for name, (low, high) in said["stops"].items()}

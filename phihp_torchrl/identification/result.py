@@ -98,7 +98,9 @@ class Identification:
         """Write :meth:`to_json` to a file, and return its path."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n")
+        path.write_text(
+            json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8"
+        )
         return path
 
     def task(self, task: Task, *, fixed: bool = False) -> Task:

@@ -16,6 +16,9 @@ __all__ = ["RK4", "Dopri5", "Integrator", "SemiImplicitEuler", "StateLayout", "m
 INTEGRATORS: Registry[type[Integrator]] = Registry("integrator")
 """Integrators by the name that settings use."""
 
+_MOST_SUBSTEPS = 1000
+"""A plan takes thousands of control steps, so that more would seem to hang."""
+
 for _integrator in (SemiImplicitEuler, RK4, Dopri5):
     INTEGRATORS.register(_integrator.name, _integrator)
 
@@ -59,6 +62,8 @@ def check_integrator(config: Any) -> None:
     """
     check_choice(config, "integrator", INTEGRATORS)
     check_count(config, "substeps")
+    if config.substeps > _MOST_SUBSTEPS:
+        raise ConfigError("substeps", f"expected at most {_MOST_SUBSTEPS}, got {config.substeps}.")
     if config.substeps > 1 and not has_substeps(config.integrator):
         raise ConfigError("substeps", f"expected 1 for {config.integrator}, got {config.substeps}.")
 

@@ -31,6 +31,7 @@ from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.policy_phase import build_policy
 from phihp_torchrl.trainers.policy_search import PolicySearch
 from phihp_torchrl.trainers.record import record
+from phihp_torchrl.trainers.rehearsal import rehearse
 from phihp_torchrl.trainers.results import read_controllers, read_learned, read_result
 from phihp_torchrl.trainers.run import RunResult, run
 from phihp_torchrl.trainers.run_checks import check_run

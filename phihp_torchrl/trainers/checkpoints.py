@@ -45,7 +45,7 @@ class SafeStateAdapter(CheckpointAdapter):
     ) -> Any:
         path.mkdir(parents=True, exist_ok=True)
         (path / "tensors.safetensors").write_bytes(component.data)
-        (path / "tree.json").write_text(component.tree)
+        (path / "tree.json").write_text(component.tree, encoding="utf-8")
 
     def load(
         self,

@@ -126,19 +126,16 @@ class RealData:
                     callback=lambda _, step: done.append(step.clone()),
                 ), None
         except ConfigError as error:  # of a guard or a controller, which says enough
-            cause, failure = error, error
+            failure = error
         # Somebody else's environment may raise anything, and its steps were dear.
         except Exception as error:
-            cause, failure = (
-                error,
-                ConfigError(
-                    "world",
-                    f"its environment failed at step {len(done)} of {steps}: "
-                    f"{type(error).__name__}: {error} The {len(done)} steps before it are kept, "
-                    "and a resumed run goes on with them.",
-                ),
+            failure = ConfigError(
+                "world",
+                f"its environment failed at step {len(done)} of {steps}: "
+                f"{type(error).__name__}: {error} The {len(done)} steps before it are kept, and a "
+                "resumed run goes on with them.",
             )
-        failure.__cause__ = cause if cause is not failure else None
+            failure.__cause__ = error
         if not done:
             raise failure
         return torch.stack(done), failure

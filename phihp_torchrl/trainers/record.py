@@ -57,7 +57,7 @@ def record(world: World, config: CollectConfig, steps: int, seed: int, path: Pat
     env = guard_env(world.make_env(), task, config.exploration.guards, crossings)
     env.set_seed(seed)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with torch.no_grad(), path.open("w", newline="") as file:
+    with torch.no_grad(), path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["time", "episode", *task.system.state_names, *task.system.action_names])
 

@@ -16,6 +16,7 @@ import torch
 from torchrl.checkpoint import CheckpointError, GlobalRNGState
 
 from phihp_torchrl.config import ConfigError, resolve_seconds
+from phihp_torchrl.deployment import plain_defaults
 from phihp_torchrl.display import Progress
 from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.trainers.checkpoints import clear_rotation, load_latest, load_state
@@ -74,6 +75,7 @@ class _Position:
     seconds: dict[str, float]  # by phase
 
 
+@plain_defaults()
 def run(
     config: RunConfig,
     path: str | Path | None = None,

@@ -77,7 +77,7 @@ class RunDirectory:
             ConfigError: if they were damaged or edited.
         """
         try:
-            return unsealed(self.metadata.read_text())
+            return unsealed(self.metadata.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return {}
         except (OSError, ValueError, RecursionError) as error:

@@ -61,6 +61,17 @@ def test_a_stopped_run_says_how_to_go_on(
     assert str(line.value()) == "my runs/one"
 
 
+def test_an_error_of_the_system_is_one_line_with_a_path(
+    phihp: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **__: Any) -> RunResult:
+        raise OSError(28, "No space left on device", "my run/metrics.csv")
+
+    monkeypatch.setattr(job, "run", full)
+    with pytest.raises(SystemExit, match=r"^error: my run/metrics.csv: No space left on device$"):
+        phihp("train", *MODEL)
+
+
 @pytest.mark.parametrize("words", [["mode=paper"], ["-x", "policy.updates=0"]])
 def test_what_is_wrong_is_no_run(phihp: Command, place: Path, words: list[str]) -> None:
     with pytest.raises(SystemExit) as error:

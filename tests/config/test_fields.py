@@ -17,6 +17,7 @@ from phihp_torchrl.config import ConfigError, check_widths
 from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.trainers import PolicyConfig, RunConfig
 from phihp_torchrl.trainers.exploration import ExplorationConfig
+from phihp_torchrl.worlds import SimulatedConfig
 
 from .test_typed import NEEDED, settings_classes
 
@@ -125,6 +126,7 @@ def test_a_list_is_taken_as_a_tuple_and_a_guard_may_have_one_side() -> None:
         (lambda: CEMConfig(planning_horizon=10**9, replan_every=1), "planning_horizon: expected"),
         (lambda: PolicyConfig(replay_capacity=10**12), "replay_capacity: expected replay_capacity"),
         (lambda: TD3Config(actor_hidden_sizes=(65_536,) * 3), "actor_hidden_sizes: expected 1 to"),
+        (lambda: SimulatedConfig(substeps=10**9), "substeps: expected at most 1000"),
         (lambda: RunConfig("pendulum", threads=10**6), "threads: expected at most"),
         (lambda: RunConfig("pendulum", world="simulated"), "world: expected settings of a world"),
         (lambda: RunConfig("pendulum", sections={"model": {}}), "model: expected a ModelConfig"),

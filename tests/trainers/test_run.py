@@ -8,14 +8,25 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment import load_agent
+from phihp_torchrl.tasks import get_task
 from phihp_torchrl.trainers import ModelConfig, run
 from phihp_torchrl.trainers.checkpoints import load_state
 
-from .run_parts import CONFIG, EVALUATE, POLICY, UNITS, assert_equal, rows, with_sections
+from .run_parts import (
+    CONFIG,
+    EVALUATE,
+    POLICY,
+    UNITS,
+    assert_equal,
+    assert_same_run,
+    rows,
+    with_sections,
+)
 
 # Whole runs
 
@@ -120,3 +131,20 @@ def test_no_graph_breaks_and_none_is_compiled_twice(whole: Path, tmp_path: Path)
         for key, value in eager.items():
             if value and key != "phase":
                 assert float(ours[key]) == pytest.approx(float(value), rel=1e-3, abs=1e-3), key
+
+
+def test_a_callers_defaults_of_dtype_and_device_change_no_result(
+    whole: Path, tmp_path: Path
+) -> None:
+    torch.set_default_dtype(torch.float64)
+    torch.set_default_device("meta")
+    try:
+        assert run(CONFIG, tmp_path / "run").finished
+        assert (torch.get_default_dtype(), torch.zeros(1).device.type) == (torch.float64, "meta")
+        agent = load_agent(tmp_path / "run" / "agent")
+    finally:
+        torch.set_default_device(None)
+        torch.set_default_dtype(torch.float32)
+    assert_same_run(tmp_path / "run", whole)
+    start = get_task("pendulum").observe(torch.tensor([0.5, 0.0]))
+    assert agent(TensorDict(observation=start))["action"].dtype == torch.float32
