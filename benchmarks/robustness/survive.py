@@ -116,7 +116,10 @@ def parts(config: RunConfig, place: Path, kills: int, flips: int) -> Iterator[di
     killed: dict[str, Counter[str]] = {kind: Counter() for kind in (AT_RANDOM, BEFORE_OPERATION)}
     for number in range(kills):
         step = 1 + number * operations // kills
-        harms = {AT_RANDOM: {"after": draw.uniform(0, seconds)}, BEFORE_OPERATION: {"step": step}}
+        harms: dict[str, dict[str, Any]] = {
+            AT_RANDOM: {"after": draw.uniform(0, seconds)},
+            BEFORE_OPERATION: {"step": step},
+        }
         for kind, harm in harms.items():
             killed[kind][survives(config, place / "killed", expected, **harm)] += 1
             shutil.rmtree(place / "killed", ignore_errors=True)
@@ -364,7 +367,7 @@ def hostile_folders() -> dict[str, int]:
 
 
 def page(found: dict[str, Any]) -> str:
-    """The page of results, with the parts that there are."""
+    """The page of results, with the parts that there are, and as many tries as were made."""
     text = (
         "# What runs and agents survive\n\n"
         f"Made by `python benchmarks/robustness/survive.py` ({origin_text(found['origin'])}). The "
