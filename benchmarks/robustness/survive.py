@@ -367,7 +367,7 @@ def hostile_folders() -> dict[str, int]:
 
 
 def page(found: dict[str, Any]) -> str:
-    """The page of results, with the parts that there are."""
+    """The page of results, with the parts that there are, and as many tries as were made."""
     text = (
         "# What runs and agents survive\n\n"
         f"Made by `python benchmarks/robustness/survive.py` ({origin_text(found['origin'])}). The "
