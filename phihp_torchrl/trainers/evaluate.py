@@ -151,7 +151,8 @@ class EvaluatePhase:
 
     def _evaluate(self, name: str, agent: Agent) -> dict[str, float]:
         settings, task = self.settings, self.agent.task
-        played = evaluate(agent, task, episodes=settings.episodes, world=self.world)
+        playing = _eager(agent) if self.world.truth is not None else agent
+        played = evaluate(playing, task, episodes=settings.episodes, world=self.world)
         if isinstance(self.world, GuardedWorld) and self.world.crossings:
             text = crossings_text(self.world.crossings)
             self.world.crossings.clear()
@@ -205,8 +206,22 @@ class EvaluatePhase:
 
     def _show(self) -> None:
         video, place = self.settings.video, self.directory.path
-        for path in show_episode(self.agent, place, world=self.world, video=video):
+        # Single plans are compiled already if their time was measured.
+        agent = self.agent if self.settings.latency_actions else _eager(self.agent)
+        for path in show_episode(agent, place, world=self.world, video=video):
             self.new_files.append(NewFile(f"evaluate/{path.stem}{path.suffix}", path))
+
+
+def _eager(agent: Agent) -> Agent:
+    """The agent with a plan that is not compiled.
+
+    A plan for all episodes at once is nearly all arithmetic: its graph would take as long to
+    compile as the episodes take, and save little. Only single plans are compiled, of which the time
+    is measured, and in worlds that are played one episode after the other.
+    """
+    if agent.planner is None or type(agent) is not Agent:  # another sort may plan otherwise
+        return agent
+    return agent.with_planner(agent.planner_config)
 
 
 def _public(config: dict[str, Any]) -> dict[str, Any]:
