@@ -179,7 +179,7 @@ class EvaluatePhase:
     def _evaluate(self, name: str, agent: Agent) -> dict[str, float]:
         settings, task = self.settings, self.agent.task
         played = evaluate(
-            agent,
+            _eager(agent) if self.world.truth is not None else agent,
             task,
             episodes=settings.episodes,
             seed=settings.first_seed,
@@ -248,9 +248,23 @@ class EvaluatePhase:
 
     def _show(self) -> None:
         video, place = self.settings.video, self.directory.path
+        # Single plans are compiled already if their time was measured.
+        agent = self.agent if self.settings.latency_actions else _eager(self.agent)
         curve = return_curve(read_rows(self.directory.metrics))
-        for path in show_episode(self.agent, place, world=self.world, video=video, curve=curve):
+        for path in show_episode(agent, place, world=self.world, video=video, curve=curve):
             self.new_files.append(NewFile(f"evaluate/{path.stem}{path.suffix}", path))
+
+
+def _eager(agent: Agent) -> Agent:
+    """The agent with a plan that is not compiled.
+
+    A plan for all episodes at once is nearly all arithmetic: its graph would take as long to
+    compile as the episodes take, and save little. Only single plans are compiled, of which the time
+    is measured, and in worlds that are played one episode after the other.
+    """
+    if agent.planner is None or type(agent) is not Agent:  # another sort may plan otherwise
+        return agent
+    return agent.with_planner(agent.planner_config)
 
 
 def _as_json(value: Any) -> Any:

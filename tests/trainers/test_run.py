@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -13,9 +16,11 @@ from torchrl.checkpoint import CheckpointError
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment import load_agent
+from phihp_torchrl.evaluation import Evaluation
 from phihp_torchrl.tasks import get_task
-from phihp_torchrl.trainers import ModelConfig, run
+from phihp_torchrl.trainers import EvaluateConfig, EvaluatePhase, ModelConfig, run
 from phihp_torchrl.trainers.checkpoints import load_state
+from phihp_torchrl.trainers.run_directory import RunDirectory
 
 from .run_parts import (
     CONFIG,
@@ -125,8 +130,9 @@ def test_no_graph_breaks_and_none_is_compiled_twice(whole: Path, tmp_path: Path)
         assert run(config, tmp_path / "compiled").finished
     counters = torch._dynamo.utils.counters
     assert not counters["graph_break"]
-    # The TD3 step, imagined chunks, returns in model and world, and plans for 2 worlds and for one.
-    assert counters["stats"]["unique_graphs"] == 6
+    # The TD3 step, imagined chunks, returns in model and world, and single plans, whose time is
+    # measured. The batch of evaluation episodes is planned without compiling.
+    assert counters["stats"]["unique_graphs"] == 5
     for ours, eager in zip(rows(tmp_path / "compiled"), rows(whole), strict=True):
         for key, value in eager.items():
             if value and key != "phase":
@@ -148,3 +154,27 @@ def test_a_callers_defaults_of_dtype_and_device_change_no_result(
     assert_same_run(tmp_path / "run", whole)
     start = get_task("pendulum").observe(torch.tensor([0.5, 0.0]))
     assert agent(TensorDict(observation=start))["action"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_plans_are_compiled_where_they_are_made_one_at_a_time(
+    whole: Path, monkeypatch: pytest.MonkeyPatch, simulated: bool
+) -> None:
+    agent, compiled = load_agent(whole / "agent", compile=True), list[bool]()
+    world: Any = SimpleNamespace(truth=agent.task.system if simulated else None, has_env=True)
+
+    def played(acting: Any, *_: Any, **__: Any) -> Evaluation:
+        compiled.append(acting.planner._compiles)
+        ones = torch.ones(1)
+        return Evaluation("pendulum", 0, ones, ones.long(), ones > 0, seconds=1.0)
+
+    def timed(acting: Any, *_: Any, **__: Any) -> Any:
+        compiled.append(acting.planner._compiles)
+        return SimpleNamespace(summary=dict)
+
+    module = import_module("phihp_torchrl.trainers.evaluate")
+    monkeypatch.setattr(module, "evaluate", played)
+    monkeypatch.setattr(module, "measure_latency", timed)
+    phase = EvaluatePhase(agent, CONFIG, EvaluateConfig(), world, RunDirectory(whole), 0)
+    phase.advance()
+    assert compiled == [not simulated, True], "returns, and the time of a plan"
