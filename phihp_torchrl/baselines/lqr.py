@@ -43,7 +43,8 @@ class LQR(Controller):
     and K solves the discrete algebraic Riccati equation by :func:`scipy.linalg.solve_discrete_are`.
     The weights are the second derivative of the reward at the goal. In units of the half-range of
     the task's wide box every component has at least 1 % of the largest, and in units of its bounds
-    every action 10 %: a reward that does not price an action, or is constant as CartPole's, still needs finite gains.
+    every action 10 %: a reward that does not price an action, or is constant as CartPole's, still
+    needs finite gains.
 
     It knows nothing of bounds, stops and the end of an episode: the action is clipped, and far from
     the goal it may fail. The registers of an actuator belong to its state, so that dead time and
