@@ -1,4 +1,4 @@
-"""The regulator that catches a model at its goal, and from how far it does."""
+"""The regulator that catches a model at its goal from furthest, and how far that is."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from phihp_torchrl.baselines.energy import find_energy
 from phihp_torchrl.baselines.lqr import LQR
 from phihp_torchrl.baselines.point import half_ranges, physical_step
 from phihp_torchrl.tasks import Task
@@ -18,19 +19,28 @@ _ARRIVED = 0.2
 """Half-ranges of the wide box, of every component, within which a regulator has arrived."""
 _MISSES = 2.0
 """How many more states caught make up for one that is not."""
-_EFFORT = 10.0
-"""Weight of a full action: where it is cheap, the regulator leans on what the model alone has."""
+_EFFORTS = (1.0, 10.0)
+"""Weights of a full action that are tried: dear actions saturate later, cheap ones are faster."""
+_CART_EFFORTS = (10.0,)
+"""Those for a cart: with cheap actions its regulator leans on learned friction."""
 
 
 def find_catch(task: Task, dynamics: nn.Module) -> tuple[LQR, float]:
-    """The regulator that catches a system around the goal, and its level.
+    """The regulator that catches the most of the states around the goal, and its level.
 
     Raises:
         ConfigError: where there is no regulator, as :meth:`LQR.from_model`.
     """
-    weights = (_EFFORT / half_ranges(task)[1].square()).tolist()
-    lqr = LQR.from_model(task, dynamics, action_weights=weights)
-    return lqr, catch_level(lqr, dynamics)[0]
+    tried = []
+    reach, energy = half_ranges(task)[1], find_energy(task)
+    carried = energy is not None and energy[0].carried
+    for effort in _CART_EFFORTS if carried else _EFFORTS:
+        weights = (effort / reach.square()).tolist()
+        lqr = LQR.from_model(task, dynamics, action_weights=weights)
+        level, share = catch_level(lqr, dynamics)
+        tried.append((share, level, lqr))
+    _, level, lqr = max(tried, key=lambda each: each[0])
+    return lqr, level
 
 
 @torch.no_grad()
