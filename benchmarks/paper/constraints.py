@@ -23,8 +23,7 @@ import torch
 from phihp_torchrl import Agent, evaluate, load_agent, load_config
 from phihp_torchrl.evaluation import EVALUATION_SEED, markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
-from phihp_torchrl.trainers import PolicyTrainer, read_run_config
-from phihp_torchrl.trainers.run_config import task_of
+from phihp_torchrl.trainers import PolicyTrainer, read_run_config, task_of
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/constraints")
 TASK, STATE, LIMIT = "pendulum", "theta_dot", 5.0

@@ -28,7 +28,7 @@ from phihp_torchrl.evaluation import TARGETS, markdown_table
 from phihp_torchrl.imagination import Rollouts
 from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.tasks import ActionBounds, Task
-from phihp_torchrl.trainers.floor import Floor
+from phihp_torchrl.trainers import Floor
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/floors")
 SEED, STARTS, UNTRAINED = 0, 64, 5

@@ -128,8 +128,9 @@ def play(
     model = world_of(task, changes).model()
     assert model is not None
     generator = torch.Generator().manual_seed(seed)
-    state = task.sample_start([episodes], generator)
-    drawn = task.outside.draw([episodes], task.max_steps + 1, generator)
+    without = get_task(TASKS[0])  # draws alike, whatever the preview
+    state = task.at_rest(without.split(without.sample_start([episodes], generator))[0])
+    drawn = without.outside.draw([episodes], task.max_steps + 1, generator)
     if constant:
         drawn = {name: values[:, :1] for name, values in drawn.items()}
     torch.manual_seed(seed)

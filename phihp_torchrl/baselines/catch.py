@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from phihp_torchrl.baselines.energy import find_energy
 from phihp_torchrl.baselines.lqr import LQR
 from phihp_torchrl.baselines.point import half_ranges, physical_step
 from phihp_torchrl.tasks import Task
@@ -20,6 +21,8 @@ _MISSES = 2.0
 """How many more states caught make up for one that is not."""
 _EFFORTS = (1.0, 10.0)
 """Weights of a full action that are tried: dear actions saturate later, cheap ones are faster."""
+_CART_EFFORTS = (10.0,)
+"""Those for a cart: with cheap actions its regulator leans on learned friction."""
 
 
 def find_catch(task: Task, dynamics: nn.Module) -> tuple[LQR, float]:
@@ -29,8 +32,9 @@ def find_catch(task: Task, dynamics: nn.Module) -> tuple[LQR, float]:
         ConfigError: where there is no regulator, as :meth:`LQR.from_model`.
     """
     tried = []
-    reach = half_ranges(task)[1]
-    for effort in _EFFORTS:
+    reach, energy = half_ranges(task)[1], find_energy(task)
+    carried = energy is not None and energy[0].carried
+    for effort in _CART_EFFORTS if carried else _EFFORTS:
         weights = (effort / reach.square()).tolist()
         lqr = LQR.from_model(task, dynamics, action_weights=weights)
         level, share = catch_level(lqr, dynamics)

@@ -37,7 +37,7 @@ class PumpConfig:
     excess: float = 0.0
     cart_reach: float = 1.0
     cart_stiffness: float = 4.0
-    cart_damping: float = 0.7
+    cart_damping: float = 2.0
 
     def __post_init__(self) -> None:
         check_fields(self)

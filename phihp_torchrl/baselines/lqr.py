@@ -39,11 +39,12 @@ class Weights(NamedTuple):
 class LQR(Controller):
     r"""The linear-quadratic regulator at the task's goal: :math:`u = u_0 - K (s - s_0)`.
 
-    The model's one step is linearised by automatic differentiation, and K solves the discrete
-    algebraic Riccati equation by :func:`scipy.linalg.solve_discrete_are`. The weights are the
-    second derivative of the reward at the goal. In units of the half-range of the task's wide box
-    every component has at least 1 % of the largest, and in units of its bounds every action 10 %: a
-    reward that does not price an action, or is constant as CartPole's, still needs finite gains.
+    The model's one step is linearised, by secants across a tenth of the half-ranges of the state,
+    and K solves the discrete algebraic Riccati equation by :func:`scipy.linalg.solve_discrete_are`.
+    The weights are the second derivative of the reward at the goal. In units of the half-range of
+    the task's wide box every component has at least 1 % of the largest, and in units of its bounds
+    every action 10 %: a reward that does not price an action, or is constant as CartPole's, still
+    needs finite gains.
 
     It knows nothing of bounds, stops and the end of an episode: the action is clipped, and far from
     the goal it may fail. The registers of an actuator belong to its state, so that dead time and

@@ -121,7 +121,7 @@ def test_observations_of_another_size_are_refused() -> None:
 def test_friction_that_is_steep_at_rest_does_not_pass_for_a_viscous_one() -> None:
     class Rubbed(torch.nn.Module):
         def forward(self, state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-            rub = 0.01 * (state[..., 1:] / 1e-4).tanh()  # m/s in a step, whose slope at 0 is 100
+            rub = 1e-3 * (state[..., 1:] / 1e-5).tanh()  # m/s in a step, whose slope at 0 is 100
             return clean(state, action) - torch.cat([torch.zeros_like(rub), rub], -1)
 
     task = task_of(Slider())
