@@ -8,12 +8,9 @@ from phihp_torchrl.trainers.collect import CollectConfig, Policy, planning_polic
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.evaluate import EvaluateConfig, EvaluatePhase
 from phihp_torchrl.trainers.exploration import Exploration, ExplorationConfig
-<<<<<<< HEAD
 from phihp_torchrl.trainers.files import write_atomically
 from phihp_torchrl.trainers.finite import NonFiniteError
-=======
 from phihp_torchrl.trainers.floor import Floor
->>>>>>> rest15
 from phihp_torchrl.trainers.imagined_analytic import ImaginedAnalytic
 from phihp_torchrl.trainers.imagined_td3 import ImaginedTD3
 from phihp_torchrl.trainers.learners import (

@@ -116,7 +116,6 @@ class RealData:
         """Real steps, and the error that ended them early."""
         assert self.env is not None
         done: list[TensorDictBase] = []
-        cause: Exception
         try:
             with torch.no_grad():
                 return self.env.rollout(
