@@ -42,6 +42,8 @@ class Problem:
             or ``None``.
         value: a function from observation and action to min(Q1, Q2) ``[rows]``, or ``None``. Needs
             an actor.
+        judge: a function from first states and actions ``[H, rows, m]`` to scores ``[rows]``, which
+            takes the place of equation 4 where there are no candidates of an actor; or ``None``.
 
     Examples:
         >>> from phihp_torchrl import HybridDynamics, get_task
@@ -58,6 +60,7 @@ class Problem:
     bounds: ActionBounds
     actor: Callable[[Any], Tensor] | None = None
     value: Callable[[Any, Tensor], Tensor] | None = None
+    judge: Callable[[Any, Tensor], Tensor] | None = None
 
 
 def score_sequences(
@@ -101,6 +104,9 @@ def score_sequences(
         ``[H, rows, m]``.
     """
     model, actor = problem.model, problem.actor
+    if problem.judge is not None:
+        scores = problem.judge(state, actions)
+        return torch.nan_to_num(scores, *(float("-inf"),) * 3), actions
     taken = []
     discount, previous = 1.0, last
     for k, action in enumerate(actions.unbind(0)):

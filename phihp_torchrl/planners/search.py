@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 from phihp_torchrl.config import (
@@ -76,6 +76,10 @@ class SearchConfig:
     tail_dtype: str = "float32"
 
     def __post_init__(self) -> None:
+        for field in fields(self):  # numbers of NumPy, and tensors of one number
+            value = getattr(self, field.name)
+            if not isinstance(value, (str, bool, int, float)) and hasattr(value, "item"):
+                object.__setattr__(self, field.name, value.item())
         check_steps(self, "planning_horizon")
         check_count(self, "optim_steps", "num_candidates")
         check_count(self, "top_k", most="num_candidates")

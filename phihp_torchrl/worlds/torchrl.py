@@ -24,6 +24,7 @@ from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.command_memory import command_memory
 from phihp_torchrl.worlds.constraint_end import ConstraintEnd
+from phihp_torchrl.worlds.open_limits import open_limits
 from phihp_torchrl.worlds.signal_source import signal_source
 
 
@@ -129,7 +130,7 @@ def fit_env(task: Task, env: EnvBase) -> EnvBase:
     if reward is None or reward.shape.numel() != 1:
         found = "none" if reward is None else f"shape {list(reward.shape)}"
         raise ConfigError("world", f"expected a 'reward' of one number, got {found}.")
-    transforms = []
+    transforms = open_limits(env)
     doubles = [
         key
         for key in ("observation", "reward")
