@@ -32,7 +32,6 @@ __all__ = [
     "Batch",
     "BoxStates",
     "DataStates",
-    "LatentModelEnv",
     "MixtureStates",
     "Rollouts",
     "SignalStream",

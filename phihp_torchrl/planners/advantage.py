@@ -38,7 +38,9 @@ def advantage_judge(
             ended = over if ended is None else ended | over
             shape = step.get(model.reward_key).shape
             steps.append(step.set(model.reward_key, reward.reshape(shape)))
-        sequences = torch.stack(steps, 1).contiguous()
+        # What a reset writes and a step does not, the first one has alone.
+        common = set.intersection(*(set(step.keys(True, True)) for step in steps))
+        sequences = torch.stack([step.select(*common) for step in steps], 1).contiguous()
         module(sequences)
         found = sequences.get(key, None)
         if found is None or found.numel() != rows * len(steps):

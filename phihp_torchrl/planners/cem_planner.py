@@ -110,7 +110,9 @@ class CEMPlanner(SamplingPlanner):
 
     def _arrange(self) -> None:
         s, now = self.settings, self.receding
-        if not (s.replan_every > 1 or s.warm_start or s.change_cost > 0):
+        if not isinstance(s, CEMConfig):
+            pass  # the base class says so
+        elif not (s.replan_every > 1 or s.warm_start or s.change_cost > 0):
             self.receding = None
         elif now is None or (now.replan_every, now.warm_start) != (s.replan_every, s.warm_start):
             self.receding = RecedingHorizon(s.replan_every, s.warm_start)

@@ -78,4 +78,10 @@ def _signature(tensor: Tensor) -> Hashable:
 
 def _laid_out(tensor: Tensor) -> Tensor:
     """The same numbers with the strides of a new tensor, also along dimensions of size one."""
-    return tensor.reshape(tensor.numel()).view(tensor.shape)
+    strides, size = [], 1
+    for length in reversed(tensor.shape):
+        strides.append(size)
+        size *= max(length, 1)
+    if tensor.stride() == (usual := tuple(reversed(strides))):
+        return tensor
+    return tensor.contiguous().as_strided(tensor.shape, usual)

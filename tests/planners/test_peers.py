@@ -3,7 +3,7 @@
 Each test runs on the stock class and on ours. Deliberately different are:
 
 - The stock ``WorldModelEnv`` passes on what a done head writes; ours makes a bool of it.
-- A reset without a start raises a ``RuntimeError`` there and a ``ConfigError`` here, which names the
+- A reset without a start raises a ``RuntimeError`` there, and here a ``ConfigError`` that names the
   keys; with ``start=`` ours can be reset.
 - The stock planner ends sequences at ``"done"``, ours at ``"terminated"`` (``done_keys``).
 """
@@ -46,7 +46,7 @@ ROWS, SEEN, LATENT, ACTION = 3, 8, 4, 2
 def test_a_planner_writes_an_action_and_nothing_else(planner_class, batch):
     torch.manual_seed(1)
     env = MockBatchedUnLockedEnv(device="cpu")
-    planner = planner_class(env, planning_horizon=10, optim_steps=2, num_candidates=100, top_k=2)
+    planner = planner_class(env, planning_horizon=4, optim_steps=2, num_candidates=20, top_k=2)
     check_planner(env, planner, batch)
 
 
@@ -62,9 +62,9 @@ def test_a_planner_by_advantage_writes_an_action_and_nothing_else(planner_class,
         env,
         module,
         temperature=1.0,
-        planning_horizon=10,
+        planning_horizon=4,
         optim_steps=2,
-        num_candidates=100,
+        num_candidates=20,
         top_k=2,
     )
     check_planner(env, planner, batch)
@@ -113,7 +113,7 @@ class Specs(EnvBase):
         seen = {key: Unbounded((*batch, size)) for key, size in observations.items()}
         self.observation_spec = Composite(seen, shape=batch)
         self.action_spec, self.reward_spec = Unbounded((*batch, ACTION)), Unbounded((*batch, 1))
-        self.done_spec = Binary((*batch, 1), dtype=torch.bool)
+        self.done_spec = Binary(shape=(*batch, 1), dtype=torch.bool)
 
     def _reset(self, tensordict=None, **_):
         raise NotImplementedError
@@ -204,11 +204,11 @@ def test_what_a_done_head_writes_becomes_a_bool(done, limit):
 
 def test_what_does_not_fit_is_named():
     model = linear_model()
-    with pytest.raises(ValueError, match="^base_env: expected an environment with the specs"):
+    with pytest.raises(ValueError, match=r"^base_env: expected an environment with the specs"):
         WorldModelEnv.from_world_model(model)
-    with pytest.raises(ValueError, match="^base_env: expected observations .*observation"):
+    with pytest.raises(ValueError, match=r"^base_env: expected observations .*observation"):
         WorldModelEnv.from_world_model(model, Specs(other=SEEN))
     model = linear_model()
     model.encoder.out_keys = ["elsewhere"]
-    with pytest.raises(ValueError, match="^world_model: expected an encoder that writes"):
+    with pytest.raises(ValueError, match=r"^world_model: expected an encoder that writes"):
         WorldModelEnv.from_world_model(model, Specs(observation=SEEN))

@@ -1,4 +1,4 @@
-"""Planners in other people's pipelines: sent to processes, changed by attributes, with any strides."""
+"""Planners in other people's pipelines: sent to processes, changed, with inputs of any strides."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_what_does_not_fit_is_refused_and_nothing_changes():
         with pytest.raises(ValueError, match=f"^{name}: expected"):
             setattr(planner, name, value)
         assert getattr(planner, name) is before
-    with pytest.raises(ValueError, match="^top_k: expected at most num_candidates = 32, got 99"):
+    with pytest.raises(ValueError, match=r"^top_k: expected at most num_candidates = 32, got 99"):
         planner.top_k = 99
     assert planner.top_k == 5
     planner.qvalue = None
@@ -128,7 +128,7 @@ def test_the_keys_to_read_can_be_given():
     start = env.reset().exclude("observation")
     assert make_planner(env, backend="env", in_keys=["state"])(start)["action"].abs() <= 2
     for keys, actor_ in ((["elsewhere"], None), (["state"], actor)):
-        with pytest.raises(ValueError, match="^in_keys: expected"):
+        with pytest.raises(ValueError, match=r"^in_keys: expected"):
             make_planner(env, actor_, in_keys=keys)
 
 
@@ -150,7 +150,7 @@ def test_an_actor_that_has_no_use_is_said(caplog):
 
 
 def test_an_advantage_module_scores_as_the_return_does():
-    """Of one value for all, the λ-return with λ = 1 and γ = 1 is the sum of rewards and the value."""
+    """With λ = 1, γ = 1 and no value the λ-return is the sum of rewards."""
     _, env, _, _ = task_parts("pendulum")
 
     class Flat(nn.Module):
@@ -171,9 +171,9 @@ def test_an_advantage_module_scores_as_the_return_does():
 
 def test_settings_and_numbers_together_are_refused():
     _, env, actor, _ = task_parts("pendulum")
-    with pytest.raises(ValueError, match="^settings: expected these alone or"):
+    with pytest.raises(ValueError, match=r"^settings: expected these alone or"):
         MPPIPlanner(env, SMALL, 1.0, actor=actor)
-    with pytest.raises(ValueError, match="^actor: expected none beside an advantage_module"):
+    with pytest.raises(ValueError, match=r"^actor: expected none beside an advantage_module"):
         MPPIPlanner(env, nn.Linear(1, 1), 1.0, 3, 2, 16, 4, actor=actor)
 
 

@@ -15,7 +15,7 @@ from torchrl.envs import check_env_specs
 from phihp_torchrl import MPPIPlanner
 from phihp_torchrl.planners import MPPIConfig
 from phihp_torchrl.tasks import ActionBounds
-from phihp_torchrl.tdmpc import LatentEnv, ScheduledMPPIConfig, make_latent_planner
+from phihp_torchrl.tdmpc import TOLD, LatentEnv, ScheduledMPPIConfig, make_latent_planner
 
 from .told_parts import make_told
 

@@ -8,10 +8,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, StepCounter, TransformedEnv
+from torchrl.envs import ActionScaling, EnvBase, StepCounter, TransformedEnv, check_env_specs
 
 from phihp_torchrl import get_task
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.tasks import Actuator
 from phihp_torchrl.worlds import EnvWorld, SimulatedWorld, TorchRLConfig, import_object
 
 PENDULUM = get_task("pendulum")
@@ -260,5 +261,5 @@ def test_actions_stay_in_the_spec_of_a_scaled_world(extra):
         actions = scaled.rollout(30)["action"]
         assert actions.abs().max() <= 1.0
         assert actions.abs().max() > 0.5
-    with pytest.raises(ConfigError, match="expected bounds of torque within the world's, -1 to 1"):
+    with pytest.raises(ConfigError, match=r"expected bounds of torque within the world's, -1 to 1"):
         EnvWorld(task, lambda: TransformedEnv(world.make_env(), ActionScaling())).make_env()
