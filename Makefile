@@ -26,7 +26,7 @@ demo: $(STAMP) ## learn PendulumSwingup and watch it swing up
 	$(ONE_THREAD) $(BIN)/python recipes/demo.py $(ARGS)
 
 test: $(STAMP) ## run the tests (ARGS="-m 'not slow'" for the quick ones)
-	$(ONE_THREAD) $(HEADLESS) $(BIN)/python -m pytest -n 2 $(ARGS)
+	$(ONE_THREAD) $(HEADLESS) $(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
 lint: $(STAMP) ## ruff (lint and format) and mypy, changing nothing
 	$(BIN)/ruff check .

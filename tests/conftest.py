@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import random
+import sys
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import settings
+from matplotlib.figure import Figure
 
 SEED = 0
 
@@ -31,6 +34,34 @@ def seed() -> int:
     np.random.seed(SEED)
     torch.manual_seed(SEED)
     return SEED
+
+
+@pytest.fixture
+def drawn() -> None:
+    """Request it to have figures drawn; half of the time of a small evaluation goes there."""
+
+
+@pytest.fixture(autouse=True)
+def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every episode's figure is an empty one, which is written all the same."""
+    show = sys.modules.get("phihp_torchrl.evaluation.show")
+    if show is not None and "drawn" not in request.fixturenames:
+        monkeypatch.setattr(show, "episode_figure", lambda episode: Figure(figsize=(1, 1)))
+
+
+@pytest.fixture
+def aot_eager(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile as always, but for machine code, which takes minutes to make.
+
+    Graphs are traced whole and differentiated, and then run by torch.
+    """
+    compile = torch.compile
+
+    def traced(function: Any, *, fullgraph: bool, dynamic: bool | None, **_: Any) -> Any:
+        return compile(function, fullgraph=fullgraph, dynamic=dynamic, backend="aot_eager")
+
+    monkeypatch.setattr(torch, "compile", traced)
+    torch._dynamo.reset()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

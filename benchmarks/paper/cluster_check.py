@@ -32,9 +32,11 @@ CELLS = len(TASKS) * len(SEEDS)
 # The least that the phases can do; the tests of the commands take it too.
 TINY = (
     "compile=false",
+    "evaluate.baselines=none",
     "evaluate.episodes=2",
     "evaluate.latency_actions=3",
     "model.fit.steps=2",
+    "model.integrator=semi_implicit_euler",
     "model.collect.planning_horizon=3",
     "model.collect.replan_every=2",
     "model.collect.num_candidates=8",
@@ -84,6 +86,7 @@ def grid_command(place: Path, launcher: str) -> list[str]:
         f"overrides=[{overrides}]",
         f"hydra.sweep.dir={place / 'multirun'}",
         "refresh=0.5",
+        "allow_dirty=true",  # nothing of it is kept
     ]
 
 

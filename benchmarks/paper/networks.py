@@ -58,6 +58,7 @@ def train(
     agent = load_agent(AGENTS / task)
     config = read_run_config(load_config(task, overrides=VARIANTS[variant])).section("policy")
     torch.manual_seed(seed)
+    assert agent.dynamics is not None  # of an agent that was trained in it
     trainer = PolicyTrainer(agent.task, agent.dynamics, config, seed=seed, compile=compile)
     origin = describe_origin(seed)
     if commit:

@@ -31,7 +31,10 @@ def main(composed: DictConfig) -> str:
         config = from_mapping(GridConfig, mapping)
     except ConfigError as error:
         sys.exit(f"error: {error}")
-    return work(config, Path(HydraConfig.get().runtime.cwd)).status.value
+    try:
+        return work(config, Path(HydraConfig.get().runtime.cwd)).status.value
+    except ConfigError as error:
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

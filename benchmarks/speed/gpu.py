@@ -159,9 +159,10 @@ def page(record: dict[str, Any]) -> str:
     text = (
         "# One GPU against one thread of the CPU\n\n"
         f"Made by `python benchmarks/speed/gpu.py` ({origin_text(record['origin'])}, torch "
-        f"{record['origin']['versions']['torch']}, {record['gpu'] or 'no GPU: the CPU alone was timed'}). Networks and "
-        f"planner of `{AGENT}`. Each cell is what is done in a second, from the median of the "
-        "calls of at least a second; the best of the row is bold, and a dash was not run.\n\n"
+        f"{record['origin']['versions']['torch']}, "
+        f"{record['gpu'] or 'no GPU: the CPU alone was timed'}). Networks and planner of "
+        f"`{AGENT}`. Each cell is what is done in a second, from the median of the calls of "
+        "at least a second; the best of the row is bold, and a dash was not run.\n\n"
         f"Tests marked `cuda`: {record['tests']['line']}.\n"
     )
     for path, batches in BATCHES.items():

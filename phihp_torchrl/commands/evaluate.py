@@ -151,7 +151,15 @@ def _play(agent: Agent, world: World, config: PlayConfig) -> dict[str, Any]:
     from phihp_torchrl.evaluation import evaluate, evaluation_seed, measure_latency
 
     seed = evaluation_seed(config.seed)
-    played = evaluate(agent, agent.task, episodes=config.episodes, seed=seed, world=world)
+    played = evaluate(
+        agent,
+        agent.task,
+        episodes=config.episodes,
+        seed=seed,
+        # As in the run that trained it: the same episodes for all agents, each with its own noise.
+        noise_seed=seed + int(agent.metadata.get("seed") or 0),
+        world=world,
+    )
     result: dict[str, Any] = {**played.summary(), "returns": played.returns.tolist()}
     if config.latency_actions:
         latency = measure_latency(agent, agent.task, calls=config.latency_actions, seed=seed)

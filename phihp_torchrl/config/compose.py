@@ -129,16 +129,15 @@ def finish(composed: Any, overrides: Sequence[str]) -> dict[str, Any]:
     Raises:
         ConfigError: for a key in one of these sections that the settings do not have.
     """
-    config: Any = OmegaConf.create(OmegaConf.to_container(composed, resolve=True))
+    config: Any = OmegaConf.to_container(composed, resolve=True)
     presets, changes = config.pop("presets", None) or {}, config.pop("changes", None) or {}
     _name_columns(config)
     preset = presets.get(config.get("preset")) or {}
     for name, section in ((f"presets.{config.get('preset')}", preset), ("changes", changes)):
         section = _for_planner(section, config)
         _check_section(section, config, name)
-        config = OmegaConf.merge(config, section)
-    plain: Any = OmegaConf.to_container(config, resolve=True)
-    return apply_overrides(plain, overrides)
+        config = _merged(config, section)
+    return apply_overrides(config, overrides)
 
 
 def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -224,6 +223,16 @@ def _quoted(value: Any) -> str:
         escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + m[2].replace("'", "\\'"), value)
         return f"'{escaped}'"
     return repr(value)
+
+
+def _merged(config: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``config`` with changes; mappings are merged, and other values replaced."""
+    merged = dict(config)
+    for key, value in changes.items():
+        known = merged.get(key)
+        both = isinstance(known, Mapping) and isinstance(value, Mapping)
+        merged[key] = _merged(known, value) if both else value  # type: ignore[arg-type]
+    return merged
 
 
 def _name_columns(config: Any) -> None:

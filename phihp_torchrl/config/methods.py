@@ -127,7 +127,8 @@ _HYBRID = ("model", "policy", "calibrate", "evaluate")
 _REAL = ("model", "td3", "calibrate", "evaluate")
 _PLANNED = ("model", "evaluate")
 
-# Plain CEM has no Q beyond its horizon, so it looks further ahead and discounts nothing.
+# Plain CEM has no Q beyond its horizon, so it looks further ahead and discounts nothing. It is that
+# of the paper: what a task changes in PhIHP's search is no part of it.
 _PLAIN_CEM = MappingProxyType(
     {
         "planning_horizon": 30,
@@ -137,7 +138,15 @@ _PLAIN_CEM = MappingProxyType(
         "top_k": 20,
         "optim_steps": 3,
         "init_std": 1.0,
+        "min_std": 0.0,
         "gamma": 1.0,
+        "alpha": 1.0,
+        "select": "mean",
+        "num_kept_elites": 0,
+        "warm_start": False,
+        "keep_incumbent": False,
+        "noise_beta": 0.0,
+        "change_cost": 0.0,
     }
 )
 

@@ -8,7 +8,12 @@ from phihp_torchrl.evaluation.figures import episode_figure
 from phihp_torchrl.evaluation.latency import Latency, measure_latency
 from phihp_torchrl.evaluation.published import PUBLISHED, TARGETS, Published
 from phihp_torchrl.evaluation.returns import Evaluation, evaluate
-from phihp_torchrl.evaluation.seeds import EVALUATION_SEED, check_training_seed, evaluation_seed
+from phihp_torchrl.evaluation.seeds import (
+    EVALUATION_SEED,
+    PROOF_SEED,
+    check_training_seed,
+    evaluation_seed,
+)
 from phihp_torchrl.evaluation.show import show_episode
 from phihp_torchrl.evaluation.table import TaskResult, markdown_table, mean_and_std, returns_table
 from phihp_torchrl.evaluation.video import write_gif

@@ -91,6 +91,7 @@ def evaluate(
     *,
     episodes: int = 50,
     seed: int = EVALUATION_SEED,
+    noise_seed: int | None = None,
     world: World | None = None,
     env: EnvBase | None = None,
     device: torch.device | str | None = None,
@@ -106,8 +107,9 @@ def evaluate(
             episodes as its batch. ``"is_init"`` is true where an episode starts.
         task: a task or the name of a registered one.
         episodes: number of episodes.
-        seed: seed of the first states, and of torch's global generator for the policy. See
-            :func:`~phihp_torchrl.evaluation.evaluation_seed`.
+        seed: seed of the first states. See :func:`~phihp_torchrl.evaluation.evaluation_seed`.
+        noise_seed: seed of torch's global generator, from which a policy draws its noise. Defaults
+            to ``seed``.
         world: the world. Defaults to the simulated world of the task.
         env: a TorchRL environment to use instead of a world, of batch size ``[]`` or ``[n]``; it
             is reset as often as needed, and stepped ``task.max_steps`` times at most.
@@ -137,7 +139,7 @@ def evaluate(
     start = time.perf_counter()
     cuda = [device] if device.type == "cuda" else []
     with torch.random.fork_rng(devices=cuda), torch.no_grad():
-        torch.manual_seed(seed)
+        torch.manual_seed(seed if noise_seed is None else noise_seed)
         if model is not None:
             played = _play_model(policy, model, task, episodes, seed, device)
         else:

@@ -8,6 +8,10 @@ EVALUATION_SEED = 1_000_000
 """The first seed of evaluation; training and the choice of actors use smaller seeds."""
 
 
+PROOF_SEED = 2_000_000
+"""The first seed of the episodes that are kept for a last proof: no report looks at them before."""
+
+
 def evaluation_seed(k: int = 0) -> int:
     """Return the ``k``-th seed of evaluation, which no training uses.
 

@@ -51,7 +51,8 @@ class ChunkNoise(NamedTuple):
 
     def to(self, device: torch.device | str) -> ChunkNoise:
         """Return it on another device."""
-        return ChunkNoise(*(part if part is None else part.to(device) for part in self))
+        signals = None if self.signals is None else self.signals.to(device)
+        return ChunkNoise(*(part.to(device) for part in self[:4]), signals)
 
 
 def draw_noise(

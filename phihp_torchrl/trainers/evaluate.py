@@ -14,6 +14,7 @@ from phihp_torchrl.config import check_count
 from phihp_torchrl.deployment import Agent, save_agent
 from phihp_torchrl.evaluation import (
     BASELINES_KEY,
+    EVALUATION_SEED,
     controllers_table,
     evaluate,
     measure_latency,
@@ -36,6 +37,7 @@ class EvaluateConfig:
 
     Args:
         episodes: real episodes, from seeds that no training uses.
+        first_seed: seed of these episodes.
         latency_actions: actions whose time is measured, one at a time; 0 for none.
         video: whether to write a GIF of an episode (needs the extra rendering).
         baselines: controllers by hand to play beside the agent, built in its model; auto (the quick
@@ -52,12 +54,14 @@ class EvaluateConfig:
     """
 
     episodes: int = 50
+    first_seed: int = EVALUATION_SEED
     latency_actions: int = 200
     video: bool = True
     baselines: str | tuple[str, ...] = "auto"
 
     def __post_init__(self) -> None:
         check_count(self, "episodes")
+        check_count(self, "first_seed", least=EVALUATION_SEED)
         check_count(self, "latency_actions", least=0)
         check_names(self.baselines)
 
@@ -151,7 +155,15 @@ class EvaluatePhase:
 
     def _evaluate(self, name: str, agent: Agent) -> dict[str, float]:
         settings, task = self.settings, self.agent.task
-        played = evaluate(agent, task, episodes=settings.episodes, world=self.world)
+        played = evaluate(
+            agent,
+            task,
+            episodes=settings.episodes,
+            seed=settings.first_seed,
+            # The episodes are those of every run, and the planner's noise is the run's own.
+            noise_seed=settings.first_seed + self.config.seed,
+            world=self.world,
+        )
         if isinstance(self.world, GuardedWorld) and self.world.crossings:
             text = crossings_text(self.world.crossings)
             self.world.crossings.clear()
@@ -175,6 +187,7 @@ class EvaluatePhase:
             self.world,
             settings.baselines,
             episodes=settings.episodes,
+            seed=settings.first_seed,
             latency_actions=settings.latency_actions,
         )
         if beside:

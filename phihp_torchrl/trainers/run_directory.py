@@ -12,8 +12,10 @@ from typing import Any
 
 from omegaconf import OmegaConf
 from torchrl.checkpoint import CheckpointRotation
+from yaml import YAMLError
 
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.trainers.yaml_file import read_yaml
 
 # What runs did before there were these settings, whose defaults are others.
 _BEFORE = {
@@ -64,12 +66,12 @@ class RunDirectory:
         if not self.config.is_file():
             raise ConfigError(str(self.path), "not the directory of a run, it has no config.yaml.")
         try:
-            config = OmegaConf.to_container(OmegaConf.load(self.config))
-        except Exception as error:  # YAML's, OmegaConf's and the system's errors have no base
+            config = read_yaml(self.config)
+        except (YAMLError, OSError, ValueError) as error:
             raise ConfigError(str(self.config), f"cannot be read: {error}") from error
         if not isinstance(config, dict):
             raise ConfigError(str(self.config), f"expected keys and values, got {config!r}.")
-        return _complete(config)  # type: ignore[arg-type]
+        return _complete(config)
 
     def write_config(self, config: Mapping[str, Any]) -> None:
         """Write the configuration, as YAML."""

@@ -237,6 +237,7 @@ def test_entropy_keeps_the_actor_from_its_ends():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("aot_eager")
 def test_compiled_it_is_the_same():
     plain, fast = make_update(), make_update(compile=True)
     state, drawn = draws()

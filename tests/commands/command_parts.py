@@ -16,7 +16,7 @@ SMALL = (
 )
 """A run of PhIHP through all of its phases."""
 
-FAST = (*SMALL, "evaluate.video=false", "evaluate.latency_actions=0")
+FAST = (*SMALL, "evaluate.episodes=1", "evaluate.video=false", "evaluate.latency_actions=0")
 """The same without what takes time to show."""
 
 BRIEF = (

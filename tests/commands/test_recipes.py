@@ -19,7 +19,7 @@ def test_phihp_then_resume_then_evaluate(
     recipe: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trained = tmp_path / "run"
-    recipe("phihp", "task=pendulum", f"run_dir={trained}", *SMALL)
+    recipe("phihp", "task=pendulum", f"run_dir={trained}", *SMALL, "evaluate.baselines=[lqr]")
     assert "| pendulum | 1 | 60 |" in capsys.readouterr().out
     assert (trained / "episode.gif").stat().st_size > 0
     assert not (tmp_path / "outputs").exists()
@@ -34,7 +34,7 @@ def test_phihp_then_resume_then_evaluate(
     capsys.readouterr()
     shutil.copytree(trained / "agent", tmp_path / "agent")
     small = ("episodes=2", "latency_actions=3")
-    recipe("evaluate", "agent=agent", *small)
+    recipe("evaluate", "agent=agent", *small)  # with the baselines that there are
     assert "| pendulum in simulated | planner | actor |" in capsys.readouterr().out
     results = json.loads((tmp_path / "agent" / "evaluation.json").read_text())
     assert results.keys() == {"planner", "actor", "baselines"}
@@ -45,6 +45,7 @@ def test_phihp_then_resume_then_evaluate(
     # What the run itself found: the same seeds, so the same returns.
     during = json.loads((trained / "evaluation.json").read_text())
     assert during["planner"]["returns"] == results["planner"]["returns"]
+    assert during["baselines"]["lqr"]["returns"] == results["baselines"]["lqr"]["returns"]
     load_agent(tmp_path / "agent")  # what the recipe writes beside it does no harm
 
     alone = ("planner=false", "out_dir=there", "video=false", "baselines=none", *small)
@@ -108,7 +109,8 @@ def test_tdmpc_then_resume_then_evaluate(
 def test_cem_then_evaluate(
     recipe: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = ("planner.num_candidates=30", "planner.planning_horizon=5", *BRIEF)
+    small = ("planner.num_candidates=8", "planner.top_k=2", "planner.planning_horizon=2",
+             "planner.optim_steps=1", "planner.replan_every=2", *BRIEF)  # fmt: skip
     recipe("cem", "task=pendulum", "run_dir=run", *small)
     assert "| pendulum | 1 | 0 |" in capsys.readouterr().out
     recipe(*EVALUATE)

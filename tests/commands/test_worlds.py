@@ -13,7 +13,7 @@ import yaml
 from .command_parts import FAST, RIG, metrics_column
 from .conftest import Command
 
-PLAY = ("episodes=2", "latency_actions=0", "video=false")
+PLAY = ("episodes=1", "latency_actions=0", "video=false")
 
 
 @pytest.fixture
@@ -44,10 +44,11 @@ def test_a_gymnasium_id_from_training_to_playing(
     assert "pendulum in gymnasium Pendulum-v1" in capsys.readouterr().out
     # The world that it was trained in, by the same seeds: the same returns.
     assert returns(run / "agent" / "evaluation.json") == returns(run / "evaluation.json")
-    phihp("evaluate", "agent=run/agent", "world=simulated", *PLAY, "out_dir=simulated")
+    simulated = ("world=simulated", "out_dir=simulated", "baselines=none")
+    phihp("evaluate", "agent=run/agent", *simulated, *PLAY)
     assert "pendulum in simulated" in capsys.readouterr().out
-    simulated = returns(place / "simulated" / "evaluation.json")
-    assert simulated != returns(run / "evaluation.json")  # friction, and other starts
+    elsewhere = returns(place / "simulated" / "evaluation.json")
+    assert elsewhere != returns(run / "evaluation.json")  # friction, and other starts
 
 
 @pytest.mark.usefixtures("rig")
@@ -57,7 +58,7 @@ def test_a_module_of_the_working_directory(
     words = ("world=torchrl", "world.make=my_rig:make_env", "task=pendulum")
     phihp("train", *words, "run_dir=run", *FAST)
     assert "| pendulum in torchrl | 1 | 60 |" in capsys.readouterr().out
-    phihp("evaluate", "agent=run/agent", *PLAY)
+    phihp("evaluate", "agent=run/agent", "baselines=none", *PLAY)
     assert "pendulum in torchrl my_rig:make_env" in capsys.readouterr().out
     assert returns(place / "run/agent/evaluation.json") == returns(place / "run/evaluation.json")
     # Its keyword arguments are options; that one is an environment of another task.

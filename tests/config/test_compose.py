@@ -67,8 +67,10 @@ def test_every_method_composes(method: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("preset", PRESETS)
-def test_every_method_composes_with_every_task_and_preset(method: str, preset: str) -> None:
-    for task in TASKS:
+def test_every_method_composes_with_every_preset(method: str, preset: str) -> None:
+    """With two of the tasks each, so that every task meets methods of every kind."""
+    first = list(METHODS).index(method) + PRESETS.index(preset)
+    for task in (TASKS[first % len(TASKS)], TASKS[(first + 3) % len(TASKS)]):
         ours = config(task=task, preset=preset, method=method)
         assert (ours.task, ours.preset) == (task, preset)
         check_method(ours, method)

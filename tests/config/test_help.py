@@ -98,8 +98,9 @@ def heavy_after(lines: str) -> tuple[str, list[str]]:
     return printed, re.findall(r"'(\w+)'", heavy)
 
 
-def test_the_check_for_imports_sees_torch() -> None:
-    assert "torch" in heavy_after("import phihp_torchrl; phihp_torchrl.get_task('pendulum')")[1]
+def test_the_check_for_imports_sees_what_is_imported() -> None:
+    """By the lightest of the large packages; torch takes many times longer."""
+    assert heavy_after("import matplotlib")[1] == ["matplotlib"]
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,9 @@ import threading
 from pathlib import Path
 
 import pytest
+import torch
 
-from phihp_torchrl import Agent, save_agent
+from phihp_torchrl import save_agent
 from phihp_torchrl.deployment import Controller, Safety
 
 from .agent_parts import make_agent
@@ -62,18 +63,42 @@ def test_a_plant_without_an_answer_misses_every_tick_but_the_first():
     assert numbers == [(0, 0), (1, 1), (2, 2), (3, 3), (4, 4), (5, 5)]
 
 
+def threaded(controller: Controller, rate: float, seconds: float) -> tuple[int, int]:
+    """What the recipe plays, with the plant in a thread: a process takes long to start."""
+    with listen() as line:
+        thread = plant(line, rate, round(rate * seconds))
+        played = RECIPE["control"](controller, line)
+        thread.join(5.0)
+    return played
+
+
+@pytest.fixture
+def saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A saved agent; what scripts set for their process does not reach the tests after."""
+    monkeypatch.setattr(torch, "set_flush_denormal", lambda mode: True)
+    return save_agent(make_agent(), tmp_path / "agent")
+
+
+OPTIONS = ("--rates", "50", "--seconds", "0.2")
+
+
+def test_the_recipe_plays_by_plan_and_by_actor(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(RECIPE["main"].__globals__, "play", threaded)
+    monkeypatch.setattr(sys, "argv", ["socket_loop.py", str(saved), *OPTIONS])
+    RECIPE["main"]()
+    rows = capsys.readouterr().out.strip().splitlines()[2:]
+    assert [row.split(" | ")[0] for row in rows] == ["| plan", "| actor"]
+    assert all("of 10 |" in row for row in rows)
+
+
 @pytest.mark.slow
-def test_the_recipe_and_what_measures_it_run(tmp_path: Path) -> None:
-    agent: Agent = make_agent()
-    save_agent(agent, tmp_path / "agent")
+def test_what_measures_it_has_the_plant_in_a_process(saved: Path, tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    options = ("--rates", "50", "--seconds", "0.2")
-    recipe = [sys.executable, ROOT / "recipes" / "socket_loop.py", tmp_path / "agent", *options]
-    printed = subprocess.run(recipe, env=environment, capture_output=True, text=True, check=True)
-    assert "of 10 |" in printed.stdout
     out = tmp_path / "realtime"
     script = ROOT / "benchmarks" / "paper" / "control_loops.py"
-    words = ["--agent", tmp_path / "agent", "--out", out, "--acting", "actor", *options]
+    words = ["--agent", saved, "--out", out, "--acting", "actor", *OPTIONS]
     subprocess.run([sys.executable, script, *words], env=environment, check=True)
     (row,) = json.loads((out / "realtime.json").read_text())["rows"]
     assert (row["acting"], row["ticks"]) == ("actor", 10)

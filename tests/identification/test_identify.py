@@ -118,7 +118,6 @@ def test_a_delay_is_found_with_positions_alone() -> None:
     "drive",
     [
         Actuator(1.4),
-        Actuator(1.0, lag=0.06),
         Actuator(slew=30.0),
         Actuator(dead_zone=0.6, gain_low=0.7),
     ],

@@ -20,6 +20,7 @@ from phihp_torchrl.trainers import (
     read_run_config,
     run,
 )
+from phihp_torchrl.trainers.yaml_file import read_yaml
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 from .run_parts import CONFIG, with_sections
@@ -92,7 +93,10 @@ def test_resume_names_the_directory(tmp_path: Path) -> None:
         request(f"resume={tmp_path}")
 
 
-@pytest.mark.parametrize("text", ["- 1\n", "task: [\n", "3\n"])
+@pytest.mark.parametrize(
+    "text",
+    ["- 1\n", "task: [\n", "3\n", "", "seed: 1\nseed: 2\n", "seed: !!python/name:os.system\n"],
+)
 def test_a_broken_configuration_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "config.yaml").write_text(text)
     with pytest.raises(ConfigError, match=r"config\.yaml: "):
@@ -111,6 +115,28 @@ def test_a_world_of_the_callers_is_used_and_named(tmp_path: Path) -> None:
     ]
     ours, theirs = (next(paths).read_bytes() for paths in states)
     assert ours == theirs
+
+
+def test_a_file_is_read_as_omegaconf_reads_it() -> None:
+    """Which wrote it."""
+    for path in (COMMITTED[0], COMMITTED[len(COMMITTED) // 2], COMMITTED[-1]):
+        expected = OmegaConf.to_container(OmegaConf.load(path / "config.yaml"))
+        assert read_yaml(path / "config.yaml") == expected
+
+
+@pytest.mark.parametrize(
+    "value",
+    ["1e-3", "-1E5", "+.5e2", "1.5e+3", "1.5e3", "1_0.5", "12", "0x1f", "010", "1e", "e1", ".e1",
+     ".5e3", "2026-01-31", "12:30", "yes", "off", "null", "~", ".inf", "-.inf", "'1e-3'", "${seed}",
+     "???"],
+)  # fmt: skip
+def test_values_are_those_of_omegaconf(tmp_path: Path, value: str) -> None:
+    (tmp_path / "config.yaml").write_text(f"seed: 1\nvalue: {value}\n")
+    ours, theirs = (
+        load(tmp_path / "config.yaml")["value"]
+        for load in (read_yaml, lambda p: OmegaConf.to_container(OmegaConf.load(p)))
+    )
+    assert (type(ours), ours) == (type(theirs), theirs)
 
 
 # Earlier versions
@@ -135,8 +161,8 @@ def test_every_committed_run_is_still_read() -> None:
             for key, value in kept[name].items():
                 if not isinstance(value, (dict, list)):
                     assert getattr(section, key) == value, f"{path.name}: {name}.{key}"
-        again = OmegaConf.to_container(OmegaConf.create(config.to_mapping()))
-        assert read_run_config(again) == config  # type: ignore[arg-type]
+        again = json.loads(json.dumps(config.to_mapping()))  # lists for tuples, as files have them
+        assert read_run_config(again) == config
 
 
 def test_an_older_run_is_not_given_what_has_become_the_default() -> None:

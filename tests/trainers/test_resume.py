@@ -20,44 +20,53 @@ from phihp_torchrl.trainers.interrupt import Interrupt
 
 from .run_parts import CONFIG, UNITS, Crash, assert_same_run, rows, run_module
 
+KILLS = {
+    "model: after its row, before its checkpoint": (1, "_log_unit"),
+    "policy: after its row, before its checkpoint": (4, "_log_unit"),
+    "evaluate: after a checkpoint": (6, "_save"),
+}
+"""The unit at which a run is killed, and the method of a run after which."""
+
 KILLED = """
 import os, signal, sys
 sys.path.insert(0, {tests!r})
 from phihp_torchrl.trainers import run
 from trainers.run_parts import CONFIG, run_module
 
-method = getattr(run_module._Run, {method!r})
+for number, (unit, name) in enumerate({kills!r}):
+    if child := os.fork():  # what is imported is imported once
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+        continue
+    method = getattr(run_module._Run, name)
 
-def killed(self, *arguments):
-    if self.position.unit == {unit}:
-        if {after}:
-            method(self, *arguments)
-        os.kill(os.getpid(), signal.SIGKILL)
-    return method(self, *arguments)
+    def killed(self, *arguments):
+        method(self, *arguments)
+        if self.position.unit == unit:
+            os.kill(os.getpid(), signal.SIGKILL)
 
-setattr(run_module._Run, {method!r}, killed)
-run(CONFIG, {path!r})
+    setattr(run_module._Run, name, killed)
+    run(CONFIG, f"{place}/{{number}}")
+    os._exit(1)
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("unit", "method", "after"),
-    [
-        pytest.param(1, "_log_unit", True, id="model: after its row, before its checkpoint"),
-        pytest.param(4, "_log_unit", True, id="policy: after its row, before its checkpoint"),
-        pytest.param(6, "_save", True, id="evaluate: after a checkpoint"),
-    ],
-)
-def test_a_killed_run_goes_on_as_if_nothing_had_happened(
-    whole: Path, tmp_path: Path, unit: int, method: str, after: bool
-) -> None:
-    path = tmp_path / "killed"
-    script = KILLED.format(
-        tests=str(Path(__file__).parents[1]), method=method, unit=unit, after=after, path=str(path)
-    )
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Runs in processes of their own, each killed somewhere."""
+    place = tmp_path_factory.mktemp("killed")
+    tests = str(Path(__file__).parents[1])
+    script = KILLED.format(tests=tests, kills=list(KILLS.values()), place=place)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert done.returncode == 0, done.stderr
+    return {name: place / str(number) for number, name in enumerate(KILLS)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", KILLS)
+def test_a_killed_run_goes_on_as_if_nothing_had_happened(
+    whole: Path, killed: dict[str, Path], where: str
+) -> None:
+    path = killed[where]
     torch.rand(7)  # the process that resumes has a past of its own
     assert run(CONFIG, path, resume=True).finished
     assert_same_run(path, whole)

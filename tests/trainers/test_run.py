@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -104,17 +103,9 @@ def test_from_needs_the_phases_before_of_the_same_task(whole: Path, tmp_path: Pa
 # Compiled
 
 
-def test_no_graph_breaks_and_none_is_compiled_twice(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("aot_eager")
+def test_no_graph_breaks_and_none_is_compiled_twice(whole: Path, tmp_path: Path) -> None:
     """A whole run; a break would fail it, for every graph is a full one."""
-    compile = torch.compile
-
-    def aot_compile(function: Any, *, fullgraph: bool, dynamic: bool, **_: Any) -> Any:
-        return compile(function, fullgraph=fullgraph, dynamic=dynamic, backend="aot_eager")
-
-    monkeypatch.setattr(torch, "compile", aot_compile)
-    torch._dynamo.reset()
     torch._dynamo.utils.counters.clear()
     timed = replace(EVALUATE, latency_actions=2)
     config = with_sections(replace(CONFIG, compile=True), evaluate=timed)

@@ -14,10 +14,10 @@ from phihp_torchrl.config import ConfigError
 from phihp_torchrl.imagination import Batch
 from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import ActionBounds, Box, Task, get_task
-from phihp_torchrl.trainers import ModelConfig, ModelTrainer, RealTD3Config, RealTD3Trainer
+from phihp_torchrl.trainers import ModelTrainer, RealTD3Config, RealTD3Trainer
 from phihp_torchrl.worlds import SimulatedWorld
 
-from .trainer_parts import REAL, stored
+from .trainer_parts import MODEL, REAL, stored
 
 
 class Sled(System):
@@ -144,7 +144,7 @@ def test_the_targets_value_of_a_hand_computed_step() -> None:
 
 
 def test_an_update_moves_actor_critics_and_targets_and_nothing_else() -> None:
-    data = ModelConfig(real_steps=30, steps_per_iteration=30)
+    data = replace(MODEL, real_steps=30, steps_per_iteration=30)
     model = ModelTrainer(get_task("pendulum"), data, seed=0)
     model.advance()
     before = {name: value.clone() for name, value in model.dynamics.state_dict().items()}
@@ -165,7 +165,7 @@ def test_an_update_moves_actor_critics_and_targets_and_nothing_else() -> None:
 
 
 def test_the_replay_starts_with_the_real_steps_of_the_phase_before() -> None:
-    data = ModelConfig(real_steps=40, steps_per_iteration=40)
+    data = replace(MODEL, real_steps=40, steps_per_iteration=40)
     model = ModelTrainer(replace(get_task("cartpole"), max_steps=30), data, seed=0)
     model.advance()
     given = model.transitions()
@@ -179,7 +179,7 @@ def test_the_replay_starts_with_the_real_steps_of_the_phase_before() -> None:
 
 
 def test_truncated_data_are_no_terminations() -> None:
-    data = ModelConfig(real_steps=40, steps_per_iteration=40)
+    data = replace(MODEL, real_steps=40, steps_per_iteration=40)
     model = ModelTrainer(replace(get_task("pendulum"), max_steps=10), data, seed=0)
     model.advance()
     assert model.data["next", "done"].any()

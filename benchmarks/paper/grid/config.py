@@ -15,7 +15,7 @@ from phihp_torchrl.config import (
     get_method,
     override_lines,
 )
-from phihp_torchrl.evaluation import check_training_seed
+from phihp_torchrl.evaluation import PROOF_SEED, check_training_seed
 from phihp_torchrl.trainers import import_plugins
 
 
@@ -30,6 +30,9 @@ class GridConfig:
         share: real samples, as a share of the published number; ``None`` for the preset's own.
         label: name of the settings.
         overrides: settings that all cells have, as on the command line of ``phihp train``.
+        allow_dirty: whether to run code that no commit has, as for a trial; its runs say so.
+        proof: whether the episodes are those kept for the last proof, which each cell may play
+            once; the code must be that of a commit.
         retry_failed: whether to try cells again that ended with an error.
         runs: directory of the runs in full.
         results: directory of what is kept of finished runs.
@@ -50,6 +53,8 @@ class GridConfig:
     share: float | None = 0.5
     label: str = "default"
     overrides: tuple[str, ...] = ()
+    allow_dirty: bool = False
+    proof: bool = False
     retry_failed: bool = False
     runs: str = "outputs/grid"
     results: str = "results/runs"
@@ -67,6 +72,8 @@ class GridConfig:
             raise ConfigError("share", f"expected a positive number or null, got {self.share}.")
         check_count(self, "jobs")
         check_not_negative(self, "claim_wait", "refresh")
+        if self.proof and self.allow_dirty:
+            raise ConfigError("allow_dirty", "expected false with proof=true, got true.")
         self.cell()
 
     def words(self) -> list[str]:
@@ -74,6 +81,8 @@ class GridConfig:
         cell, samples_key = self.cell(), get_method(self.method).samples_key
         lines = [f"task={cell.task}", f"method={cell.method}", f"seed={cell.seed}"]
         lines += ["progress=false", *override_lines({"plugins": self.plugins})]
+        if self.proof:
+            lines.append(f"evaluate.first_seed={PROOF_SEED}")
         if cell.samples is not None:
             lines.append(f"{samples_key}={cell.samples}")
         return [*lines, *self.method_overrides.get(self.method, ()), *self.overrides]

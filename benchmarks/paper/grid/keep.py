@@ -10,8 +10,10 @@ import shutil
 from dataclasses import asdict
 from pathlib import Path
 
+import yaml
+
 from grid.cell import CellFiles
-from measures import curve_from_metrics, prediction_errors, write_curve
+from measures import configuration_hash, curve_from_metrics, prediction_errors, write_curve
 from phihp_torchrl.deployment import Agent, load_agent
 from phihp_torchrl.worlds import SimulatedWorld, make_world
 
@@ -36,7 +38,9 @@ def keep(files: CellFiles) -> None:
         points = curve_from_metrics(csv.DictReader(file))
     write_curve(files.run / CURVE, points)
     _replace(files.run / CURVE, files.kept / CURVE)
-    (files.run / CELL).write_text(json.dumps(asdict(files.cell), indent=2) + "\n")
+    settings = yaml.safe_load((files.run / "config.yaml").read_text())
+    cell = {**asdict(files.cell), "configuration": configuration_hash(settings)}
+    (files.run / CELL).write_text(json.dumps(cell, indent=2) + "\n")
     _replace(files.run / CELL, files.kept / CELL)
     _keep_prediction(files)
     _replace(files.run / "evaluation.json", files.evaluation)

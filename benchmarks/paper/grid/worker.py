@@ -20,7 +20,8 @@ from grid.claim import claim
 from grid.config import GridConfig
 from grid.keep import is_whole, keep
 from grid.status import CellState, Status, look
-from phihp_torchrl.config import compose_yaml, override_lines
+from phihp_torchrl.config import ConfigError, compose_yaml, override_lines
+from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.trainers import RunRequest, read_request, run
 
 _log = logging.getLogger(__name__)
@@ -38,8 +39,14 @@ def work(config: GridConfig, root: Path) -> CellState:
         Its state. An error of the run is a state too: it ends this cell, not the grid.
 
     Raises:
+        ConfigError: if the code has uncommitted changes, unless ``allow_dirty``.
         KeyboardInterrupt: if a signal asked the run to stop; its checkpoint is written.
     """
+    if not config.allow_dirty and describe_origin(config.seed)["dirty"]:
+        raise ConfigError(
+            "allow_dirty",
+            "expected a tree without uncommitted changes, or allow_dirty=true for a trial.",
+        )
     files = config.files(root)
     if look(files).status is Status.DONE and is_whole(files):
         return look(files)

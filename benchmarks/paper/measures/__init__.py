@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
+from measures.censored import Between, mean_between, ratio_between
+from measures.configuration import configuration_hash
 from measures.curve import CurvePoint, curve_from_metrics, read_curve, write_curve
+from measures.differences import (
+    FEWEST_SEEDS,
+    Difference,
+    difference,
+    holm,
+    paired_difference_of_seeds,
+)
 from measures.paired import PairedDifference, paired_difference
 from measures.prediction import (
     PREDICTION_EPISODES,
@@ -15,16 +24,25 @@ from measures.samples import DEFAULT_SAMPLES, PUBLISHED_SAMPLES, PUBLISHED_UPDAT
 
 __all__ = [
     "DEFAULT_SAMPLES",
+    "FEWEST_SEEDS",
     "PREDICTION_EPISODES",
     "PREDICTION_STEPS",
     "PUBLISHED_SAMPLES",
     "PUBLISHED_UPDATES",
+    "Between",
     "CurvePoint",
+    "Difference",
     "PairedDifference",
     "UnseenEpisodes",
+    "configuration_hash",
     "curve_from_metrics",
+    "difference",
+    "holm",
+    "mean_between",
     "paired_difference",
+    "paired_difference_of_seeds",
     "prediction_errors",
+    "ratio_between",
     "read_curve",
     "unseen_episodes",
     "write_curve",

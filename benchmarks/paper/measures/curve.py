@@ -17,6 +17,8 @@ _TRAINING = {
     "actor_return": "actor",
     "planner_return": "planner",
 }
+# The phases whose `return_mean` is of their planner.
+_PLANNERS = ("tdmpc",)
 _FINAL = ("evaluate/", "/return_mean")
 
 
@@ -129,7 +131,7 @@ def _returns(row: Mapping[str, str]) -> Iterator[tuple[str, str]]:
             if (played := name.removeprefix(start).removesuffix(end)) not in BASELINES:
                 yield played, name
         elif not name.startswith(start) and (acting := _TRAINING.get(name.rpartition("/")[2])):
-            yield acting, name
+            yield "planner" if row["phase"] in _PLANNERS else acting, name
 
 
 def _number(row: Mapping[str, str], name: str, default: float = math.nan) -> float:

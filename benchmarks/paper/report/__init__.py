@@ -10,7 +10,7 @@ from report.results import Results, Score
 from report.runs import Acting, Run, RunFolders, read_run, read_runs
 from report.sections import Picture, Section
 from report.sensitivity import Trial, read_trials, write_trials
-from report.significance import Welch, welch
+from report.significance import published_difference, verdict
 from report.tables import NOT_RUN, Number, Stat, Table
 
 __all__ = [
@@ -31,15 +31,15 @@ __all__ = [
     "Stat",
     "Table",
     "Trial",
-    "Welch",
     "make_report",
     "normalise",
+    "published_difference",
     "read_run",
     "read_runs",
     "read_trials",
     "samples_to_90",
     "system",
     "systems",
-    "welch",
+    "verdict",
     "write_trials",
 ]

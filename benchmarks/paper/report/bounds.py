@@ -33,6 +33,24 @@ BOUNDS = MappingProxyType(
 """By task; a pendulum's worst place is hanging down, an acrobot's too, a cart's far away."""
 
 
+EQUIVALENT = 0.01
+"""Two returns are equivalent whose difference is, by its whole interval, within this share of the
+range between a task's bounds: stated before any run that is tested by it."""
+
+
+def margin(task: str) -> float | None:
+    """The margin of equivalence of a task's returns; ``None`` for a task that has no bounds.
+
+    Examples:
+        >>> margin("acrobot")
+        5.0
+    """
+    if task not in BOUNDS:
+        return None
+    low, high = BOUNDS[task]
+    return EQUIVALENT * (high - low)
+
+
 def normalise(task: str, value: float) -> float:
     """A return on the scale from 0 to 1.
 

@@ -21,6 +21,7 @@ from report.runs import read_runs
 from report.sections import Section
 from report.sensitivity import read_trials, sensitivity
 from report.significance import significance
+from report.soundness import soundness
 from report.time_to_return import time_to_return
 from report.write import write_report
 
@@ -85,10 +86,11 @@ def make_report(config: ReportConfig) -> Report:
     results = Results(chosen)
     sections = [
         _make("The paper's claims", lambda: claims_section(results), problems),
+        _make("Soundness", lambda: soundness(chosen), problems),
         _make("Main table", lambda: main_table(results), problems),
         _make("Learning curves", lambda: learning_curves(results), problems),
         _make("Performance over runs", lambda: aggregate_section(results, config.reps), problems),
-        _make("Welch's t-tests", lambda: significance(results), problems),
+        _make("PhIHP against each baseline", lambda: significance(results), problems),
         _make("Ablation", lambda: ablation(results), problems),
         _make("Generalization", lambda: generalization(results), problems),
         _make("TD3 in imagination", lambda: imagined_curves(results), problems),

@@ -1,12 +1,16 @@
-"""The paper's claims, each with a sentence on whether it is borne out here."""
+"""The paper's claims, each judged: shown, not shown or refuted, with effect, interval and n."""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
+from measures import Between, Difference, difference, holm, ratio_between
 from phihp_torchrl.evaluation import PUBLISHED
+from report.bounds import margin
 from report.efficiency import sample_efficiency
 from report.paper_systems import (
     DD_CEM,
@@ -23,10 +27,13 @@ from report.paper_systems import (
 from report.planner_and_actor import planning_gain, usual_groups
 from report.results import TASKS, Results, Score
 from report.sections import Section
-from report.tables import NOT_RUN
+from report.significance import LEVEL
+from report.tables import Table, TableCell
 
 FEWER = 5.0
 """The claim is of 5 to 15 times fewer samples."""
+
+SHOWN, NOT_SHOWN, REFUTED, NOT_RUN = "shown", "not shown", "refuted", "not run"
 
 _PAIRS = ((TD3_IM_PH, TD3_IM_DD), (PH_CEM, DD_CEM), (PH_TD_MPC_STAR, TD_MPC_STAR))
 
@@ -37,88 +44,136 @@ class Finding:
 
     Args:
         what: the task, or the systems and the task.
-        borne_out: whether it agrees with the claim.
-        figure: its numbers.
+        verdict: :data:`SHOWN`, :data:`NOT_SHOWN` or :data:`REFUTED`.
+        effect: its size, in words.
+        interval: what the effect lies between.
+        seeds: number of training seeds on either side.
     """
 
     what: str
-    borne_out: bool
-    figure: str
+    verdict: str
+    effect: str
+    interval: str
+    seeds: str
 
 
 def claims_section(results: Results) -> Section:
-    """A line for each claim."""
-    lines = [
-        _sentence(
-            "PhIHP needs 5 to 15 times fewer real samples than TD-MPC",
-            fewer_samples(results),
-            _published_samples(results),
+    """A sentence for each claim, and a row for each comparison."""
+    claims = {
+        f"PhIHP needs at least {FEWER:.0f} times fewer real samples than TD-MPC": fewer_samples(
+            results
         ),
-        _sentence("PhIHP earns more than TD3", _higher(results, ((PHIHP, TD3),))),
-        _sentence("Planning improves on the policy", planning_improves(results)),
-        _sentence(
-            "The hybrid model beats the data-driven one at equal samples", _higher(results, _PAIRS)
-        ),
-        _sentence(
-            "PhIHP acts faster than TD-MPC",
-            faster(results),
-            "the published times are of another machine",
-        ),
+        "PhIHP earns more than TD3": _higher(results, ((PHIHP, TD3),)),
+        "Planning improves on the policy": planning_improves(results),
+        "The hybrid model beats the data-driven one at equal samples": _higher(results, _PAIRS),
+        "PhIHP acts faster than TD-MPC": faster(results),
+    }
+    lines = [f"- **{claim}**: {sentence(findings)}" for claim, findings in claims.items()]
+    if published := _published_samples(results):
+        lines.append(f"- {published}")
+    rows: list[list[TableCell]] = [
+        [f"{i}, {f.what}", f.verdict, f.effect, f.interval, f.seeds]
+        for i, findings in enumerate(claims.values(), 1)
+        for f in findings
     ]
-    return Section("The paper's claims", "\n".join(f"- {line}" for line in lines))
+    header = ["claim, comparison", "verdict", "effect", "lies between", "seeds"]
+    return Section(
+        "The paper's claims", "\n".join(lines), {"Comparisons": Table("claims", header, rows)}
+    )
+
+
+def sentence(findings: Sequence[Finding]) -> str:
+    """What a careful reader would say of a claim."""
+    if not findings:
+        return f"{NOT_RUN}."
+    counts = Counter(finding.verdict for finding in findings)
+    total = len(findings)
+    parts = [
+        f"{verdict} in {counts[verdict]}"
+        for verdict in (SHOWN, NOT_SHOWN, REFUTED)
+        if counts[verdict]
+    ]
+    named = "; ".join(
+        f"{verdict}: {', '.join(f.what for f in findings if f.verdict == verdict)}"
+        for verdict in (SHOWN, REFUTED)
+        if counts[verdict]
+    )
+    return f"{', '.join(parts)} of {total} comparisons{f' ({named})' if named else ''}."
 
 
 def fewer_samples(results: Results) -> list[Finding]:
-    """TD-MPC's samples to 90 % over PhIHP's, by task."""
+    """TD-MPC's samples to 90 % over PhIHP's, by task, as far as their ends tell."""
     findings = []
     for task in TASKS:
         ours = sample_efficiency(results, PHIHP, task)
         theirs = sample_efficiency(results, TD_MPC, task)
-        if ours and theirs:
-            ratio = fmean(theirs) / fmean(ours)
-            figure = f"{_text(ratio)} times fewer ({fmean(ours):.0f} against {fmean(theirs):.0f})"
-            findings.append(Finding(task, ratio >= FEWER, figure))
+        if ours is not None and theirs is not None:
+            ratio = ratio_between(theirs, ours)
+            effect = f"{ours} against {theirs} samples"
+            seeds = _count(results.scores(PHIHP, task)), _count(results.scores(TD_MPC, task))
+            findings.append(_of_ratio(task, ratio, FEWER, effect, seeds))
     return findings
 
 
 def planning_improves(results: Results) -> list[Finding]:
-    """Planner less actor at the usual number of samples, by task; beyond two standard errors."""
-    findings = []
+    """Planner less actor at the usual number of samples, by task."""
     groups = usual_groups(results.runs)
-    for task, group in ((task, groups[task]) for task in groups if task in TASKS):
-        gain = planning_gain(group)
-        figure = f"{_text(gain.mean, '+')} ± {_text(gain.standard_error)}"
-        better = gain.mean > 2 * gain.standard_error
-        findings.append(Finding(task, better, figure))
-    return findings
+    found = {task: planning_gain(groups[task]) for task in groups if task in TASKS}
+    return _of_differences(found, {task: task for task in found})
 
 
 def faster(results: Results) -> list[Finding]:
-    """TD-MPC's time of an action over PhIHP's, by task."""
+    """TD-MPC's time of an action over PhIHP's, by task, over all pairs of runs."""
     findings = []
     for task in TASKS:
-        ours, theirs = (_times(results.usual(system, task)) for system in (PHIHP, TD_MPC))
+        scores = [results.usual(system, task) for system in (PHIHP, TD_MPC)]
+        ours, theirs = (_times(each) for each in scores)
         if ours and theirs:
-            ratio = fmean(theirs) / fmean(ours)
-            figure = f"{ratio:.1f} times ({fmean(ours):.1f} ms against {fmean(theirs):.1f})"
-            findings.append(Finding(task, ratio > 1, figure))
+            ratio = Between(min(theirs) / max(ours), max(theirs) / min(ours))
+            effect = f"{fmean(ours):.1f} ms against {fmean(theirs):.1f}"
+            findings.append(_of_ratio(task, ratio, 1.0, effect, (len(ours), len(theirs))))
     return findings
 
 
 def _higher(results: Results, pairs: Iterable[tuple[PaperSystem, PaperSystem]]) -> list[Finding]:
     """Mean returns of pairs; at the same samples where they are ablations of each other."""
-    findings = []
+    found: dict[str, Difference] = {}
+    tasks: dict[str, str] = {}
     for first, second in pairs:
         for task in TASKS:
             ours, theirs = results.usual(first, task), results.usual(second, task)
             if first is not PHIHP:
                 ours, theirs = _at_equal_samples(results, first, second, task)
-            if ours and theirs:
-                means = [fmean(score.mean for score in scores) for scores in (ours, theirs)]
-                figure = f"{_text(means[0])} against {_text(means[1])}"
+            gap = difference([s.mean for s in ours], [s.mean for s in theirs])
+            if gap is not None:
                 what = task if first is PHIHP else f"{first.name} on {task}"
-                findings.append(Finding(what, means[0] > means[1], figure))
+                found[what], tasks[what] = gap, task
+    return _of_differences(found, tasks)
+
+
+def _of_differences(found: dict[str, Difference], tasks: dict[str, str]) -> list[Finding]:
+    """Findings of one family of tests, by Holm."""
+    findings = []
+    adjusted = holm([gap.p for gap in found.values()])
+    for (what, gap), p in zip(found.items(), adjusted, strict=True):
+        verdict = NOT_SHOWN if not p < LEVEL else SHOWN if gap.mean > 0 else REFUTED
+        effect = _text(gap.mean, "+") + ("" if math.isnan(p) else f", p = {p:.2g}")
+        within = margin(tasks[what])
+        if verdict == NOT_SHOWN and within is not None and gap.within(within):
+            effect += ", equivalent"
+        ends = "–" if math.isnan(gap.low) else f"{_text(gap.low)} to {_text(gap.high)}"
+        findings.append(Finding(what, verdict, effect, ends, f"{gap.seeds[0]}, {gap.seeds[1]}"))
     return findings
+
+
+def _of_ratio(
+    what: str, ratio: Between, least: float, effect: str, seeds: tuple[int, int]
+) -> Finding:
+    """Shown where the whole of it is at least ``least``, refuted where none of it is."""
+    verdict = SHOWN if ratio.low >= least else REFUTED if ratio.high < least else NOT_SHOWN
+    above = "" if math.isinf(ratio.high) else f" to {ratio.high:.1f}"
+    interval = f"{ratio.low:.1f}{above or ' and more'} times"
+    return Finding(what, verdict, effect, interval, f"{seeds[0]}, {seeds[1]}")
 
 
 def _at_equal_samples(
@@ -136,30 +191,20 @@ def _times(scores: Sequence[Score]) -> list[float]:
     return [score.milliseconds for score in scores if score.milliseconds is not None]
 
 
+def _count(scores: Sequence[Score]) -> int:
+    return len({score.run.seed for score in scores})
+
+
 def _published_samples(results: Results) -> str:
-    """PhIHP's samples here against the published ones of TD-MPC."""
+    """PhIHP's samples here against the published ones of TD-MPC, which were met in other runs."""
     parts = []
     for task in TASKS:
         ours = sample_efficiency(results, PHIHP, task)
         published = PUBLISHED.get(task, {}).get(TD_MPC.name)
-        if ours and published is not None and published.samples is not None:
-            parts.append(f"{task} {1000 * published.samples / fmean(ours):.1f}")
-    return f"against TD-MPC as published, times fewer: {', '.join(parts)}" if parts else ""
-
-
-def _sentence(claim: str, findings: Sequence[Finding], unless: str = "") -> str:
-    """The claim, the verdict and the figures; ``unless`` says more where nothing was run."""
-    if not findings:
-        return f"**{claim}**: {NOT_RUN}{f' ({unless})' if unless else ''}."
-    count = sum(finding.borne_out for finding in findings)
-    if count == len(findings):
-        verdict = f"borne out here, in all {count} comparisons" if count > 1 else "borne out here"
-    elif count:
-        verdict = f"borne out here in {count} of {len(findings)} comparisons"
-    else:
-        verdict = "not borne out here"
-    figures = "; ".join(f"{f.what} {f.figure}{'' if f.borne_out else ' (not)'}" for f in findings)
-    return f"**{claim}**: {verdict}: {figures}."
+        if ours is not None and published is not None and published.samples is not None:
+            parts.append(f"{task} {ours} against {1000 * published.samples:.0f}")
+    return f"Samples to 90 %, PhIHP's against TD-MPC's as published: {', '.join(parts)}." if parts \
+        else ""  # fmt: skip
 
 
 def _text(value: float, sign: str = "") -> str:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 
+from measures import Between, mean_between
 from report.paper_systems import PaperSystem
 from report.results import Results, Score
+from report.tables import Ends
 
 SHARE = 0.9
 """The share of its own best return that a system must reach."""
@@ -37,25 +39,39 @@ def points_by_seed(scores: Sequence[Score]) -> dict[int, list[tuple[int, float]]
     return {seed: sorted(found.items()) for seed, found in sorted(points.items())}
 
 
-def samples_to_90(points: Sequence[tuple[int, float]]) -> int:
-    """The fewest real samples after which a return within a tenth of the best was reached.
+def samples_to_90(points: Sequence[tuple[int, float]]) -> Between:
+    """The real samples after which a return within a tenth of the best was reached.
 
     For the best return ``b`` the threshold is ``b − 0.1 |b|``, which is 90 % of a positive return
-    and 110 % of a negative one.
+    and 110 % of a negative one. It was passed somewhere between the evaluation that first reached
+    it and the one before, or before the first one.
 
     Args:
         points: real samples and returns of one seed.
 
     Examples:
-        >>> samples_to_90([(500, -900.0), (1000, -380.0), (2000, -360.0)])
-        1000
+        >>> str(samples_to_90([(500, -900.0), (1000, -380.0), (2000, -360.0)]))
+        '500–1000'
+        >>> str(samples_to_90([(500, -370.0), (1000, -360.0)]))
+        '≤ 500'
     """
     best = max(value for _, value in points)
     threshold = best - (1 - SHARE) * abs(best)
-    return min(samples for samples, value in points if value >= threshold)
+    first = min(samples for samples, value in points if value >= threshold)
+    before = max((samples for samples, _ in points if samples < first), default=0)
+    return Between(before, first)
 
 
-def sample_efficiency(results: Results, system: PaperSystem, task: str) -> tuple[float, ...]:
-    """The samples to 90 % of each seed; empty if the system was not run."""
+def sample_efficiency(results: Results, system: PaperSystem, task: str) -> Between | None:
+    """What a system's mean over seeds lies between; ``None`` if it was not run.
+
+    A seed with few runs has wide ends, and makes those of the mean wide: none is left out.
+    """
     by_seed = points_by_seed(results.scores(system, task))
-    return tuple(float(samples_to_90(points)) for points in by_seed.values())
+    return mean_between([samples_to_90(p) for p in by_seed.values()]) if by_seed else None
+
+
+def samples_cell(results: Results, system: PaperSystem, task: str) -> Ends:
+    """The same for a table, with the number of seeds."""
+    seeds = {score.run.seed for score in results.scores(system, task)}
+    return Ends(sample_efficiency(results, system, task), len(seeds))

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
-import torch
-
-from measures import PUBLISHED_SAMPLES, PairedDifference, paired_difference
+from measures import PUBLISHED_SAMPLES, Difference, holm, paired_difference_of_seeds
 from phihp_torchrl.evaluation import TARGETS, TaskResult, returns_table
+from report.bounds import margin
 from report.results import usual_samples
 from report.runs import Run
 from report.sections import Section
+from report.significance import verdict
 from report.tables import Number, Stat, Table, TableCell
 
 _SHARES = {"all samples": 1.0, "a half": 0.5, "a fifth": 0.2, "a tenth": 0.1}
@@ -48,12 +49,12 @@ def returns_markdown(runs: Iterable[Run]) -> str:
     return returns_table(results)
 
 
-def planning_gain(group: Sequence[Run]) -> PairedDifference:
-    """Planner less actor over the episodes of all seeds, paired."""
-    planner, actor = (
-        torch.tensor([value for run in group for value in run.acting[way].returns]) for way in _WAYS
-    )
-    return paired_difference(planner, actor)
+def planning_gain(group: Sequence[Run]) -> Difference:
+    """Planner less actor over the same episodes; each seed, which is one agent, counts once."""
+    planner, actor = ([run.acting[way].mean for run in group] for way in _WAYS)
+    found = paired_difference_of_seeds([p - a for p, a in zip(planner, actor, strict=True)])
+    assert found is not None  # a group has runs
+    return found
 
 
 def acting_section(runs: Sequence[Run]) -> Section:
@@ -61,7 +62,7 @@ def acting_section(runs: Sequence[Run]) -> Section:
     groups = both_ways(runs)
     return Section(
         "PhIHP, planner and actor",
-        "",
+        "Each training seed counts once; p-values are adjusted by Holm over the table.",
         {
             "What planning adds to the actor, the same episodes": _gain_table(groups),
             "Returns with fewer real samples": _samples_table(groups),
@@ -71,14 +72,27 @@ def acting_section(runs: Sequence[Run]) -> Section:
 
 
 def _gain_table(groups: dict[tuple[str, int], list[Run]]) -> Table:
+    found = {key: planning_gain(group) for key, group in groups.items()}
+    adjusted = holm([gain.p for gain in found.values()])
     rows: list[list[TableCell]] = []
-    for (task, samples), group in groups.items():
-        gain = planning_gain(group)
-        verdict = "worse" if gain.is_worse else "no worse"
-        numbers = [Number(value, 2, fixed=True) for value in gain]
-        rows.append([task, str(samples), *numbers, verdict])
-    header = ["task", "real samples", "planner − actor", "standard error", "beyond two of them"]
-    return Table("planning_gain", header, rows)
+    for ((task, samples), gain), p in zip(found.items(), adjusted, strict=True):
+        numbers: list[TableCell] = [
+            "–" if math.isnan(value) else Number(value, 2, fixed=True)
+            for value in (gain.mean, gain.low, gain.high)
+        ]
+        shown: TableCell = "–" if math.isnan(p) else Number(p, 2)
+        rows.append(
+            [
+                task,
+                str(samples),
+                *numbers,
+                shown,
+                str(gain.seeds[0]),
+                verdict(gain, p, margin(task)),
+            ]
+        )
+    header = ["task", "real samples", "planner − actor", "95 % from", "to", "p", "seeds"]
+    return Table("planning_gain", [*header, "the planner is"], rows)
 
 
 def _samples_table(groups: dict[tuple[str, int], list[Run]]) -> Table:

@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from grid.cell import DEFAULT_METHOD
-from measures import CurvePoint, curve_from_metrics, read_curve
+from measures import CurvePoint, configuration_hash, curve_from_metrics, read_curve
 from phihp_torchrl.evaluation import BASELINES_KEY
 from phihp_torchrl.origin import commit_text, machine_text
 
@@ -50,6 +50,7 @@ class Run:
         samples: real samples it was given.
         seed: its seed.
         kind: kind of its model; ``None`` for a method without one.
+        configuration: fingerprint of its settings, equal for runs that differ by their seed alone.
         commit: abbreviated, with a ``+`` if the source had been changed.
         machine: what it ran on.
         seconds: time of each phase.
@@ -65,6 +66,7 @@ class Run:
     samples: int
     seed: int
     kind: str | None
+    configuration: str
     commit: str
     machine: str
     seconds: Mapping[str, float]
@@ -136,6 +138,7 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
         samples=int(cell.get("samples") or metadata["real_steps"]),
         seed=int(config["seed"]),
         kind=kind,
+        configuration=configuration_hash(config),
         commit=commit_text(session),
         machine=machine_text(session),
         seconds={str(k): float(v) for k, v in metadata["seconds"].items()},

@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from measures import Between
 from phihp_torchrl.evaluation import markdown_table, mean_and_std
 
 NOT_RUN = "not run"
@@ -88,7 +89,29 @@ class Interval:
         return {"": self.value, " low": self.low, " high": self.high}
 
 
-TableCell = str | Stat | Number | Interval
+@dataclass(frozen=True)
+class Ends:
+    """What a number lies between; ``None`` if nothing was run to know it.
+
+    Args:
+        between: its ends.
+        seeds: over how many seeds.
+    """
+
+    between: Between | None
+    seeds: int
+
+    def __str__(self) -> str:
+        return NOT_RUN if self.between is None else f"{self.between} ({self.seeds})"
+
+    def columns(self) -> dict[str, float | str]:
+        """Columns of a CSV file, by what is added to the header."""
+        if self.between is None:
+            return dict.fromkeys((" from", " to", " seeds"), NOT_RUN)
+        return {" from": self.between.low, " to": self.between.high, " seeds": self.seeds}
+
+
+TableCell = str | Stat | Number | Interval | Ends
 
 
 @dataclass(frozen=True)

@@ -30,13 +30,18 @@ def test_departures_are_those_of_the_task(script):
     assert "policy.td3.value_expansion" not in script.departures("pendulum-swingup")
 
 
-@pytest.mark.parametrize("task", ["pendulum-swingup", "acrobot", "cartpole-swingup"])
-def test_every_published_value_is_one_that_a_run_takes(script, task):
-    composed = compose_yaml([f"task={task}"])
-    for key, value in script.departures(task).items():
-        words = script.changes(task, key)
-        config = read_request(composed, [f"task={task}", *words]).config
-        assert flatten(config.to_mapping())[key] == value
+def test_every_published_value_is_one_that_a_run_takes(script):
+    """Of a value that several tasks have, one is enough."""
+    taken = set()
+    for task in ("pendulum-swingup", "acrobot", "cartpole-swingup"):
+        composed = compose_yaml([f"task={task}"])
+        for key, value in script.departures(task).items():
+            words = script.changes(task, key)
+            if (key, *words) in taken:
+                continue
+            taken.add((key, *words))
+            config = read_request(composed, [f"task={task}", *words]).config
+            assert flatten(config.to_mapping())[key] == value
 
 
 def test_effects_in_words(script):

@@ -22,7 +22,13 @@ def test_the_script_runs_a_grid_shows_it_and_skips_it(
     run_script: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     quoted = ",".join(f'"{override}"' for override in TINY)
-    arguments = ("task=pendulum,cartpole", "share=0.03,0.04", "refresh=0", f"overrides=[{quoted}]")
+    arguments = (
+        "task=pendulum,cartpole",
+        "share=0.03,0.04",
+        "refresh=0",
+        "allow_dirty=true",
+        f"overrides=[{quoted}]",
+    )
     run_script("run_grid", *arguments)
     shown = capsys.readouterr().out
     assert "4 cells: 4 done" in shown
@@ -33,7 +39,13 @@ def test_the_script_runs_a_grid_shows_it_and_skips_it(
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "results").rglob("*.json")} == kept
     # One more cell, which fails, and the exit code says so.
     with pytest.raises(SystemExit) as error:
-        run_script("run_grid", "task=cartpole", "refresh=0.1", 'overrides=["policy.gama=1"]')
+        run_script(
+            "run_grid",
+            "task=cartpole",
+            "refresh=0.1",
+            "allow_dirty=true",
+            'overrides=["policy.gama=1"]',
+        )
     assert error.value.code == 1
     shown = capsys.readouterr().out
     assert "cartpole-default-n2500-seed0 failed: " in shown
@@ -92,6 +104,12 @@ def test_processes_of_one_machine(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     quoted = ",".join(f'"{override}"' for override in TINY)
     command = [sys.executable, str(PAPER / "run_grid.py"), "launcher=joblib", "jobs=2"]
-    command += ["task=pendulum", "seed=0,1", "share=0.03", f"overrides=[{quoted}]"]
+    command += [
+        "task=pendulum",
+        "seed=0,1",
+        "share=0.03",
+        "allow_dirty=true",
+        f"overrides=[{quoted}]",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=200)
     assert "2 cells: 2 done" in done.stdout, done.stderr

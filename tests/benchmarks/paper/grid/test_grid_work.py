@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 from grid_cells import PAPER, TINY, do, returns, words
 
-from grid import GridConfig, Status, claim, is_claimed, keep, look
+from grid import GridConfig, Status, claim, is_claimed, keep, look, work
 from grid.display import failures
 from measures import read_curve
+from phihp_torchrl.config import ConfigError
 from report import read_run
 
 
@@ -88,34 +89,31 @@ def test_other_methods_leave_what_a_report_reads(
     assert "p50" in run.acting[acting].latency
 
 
-def test_what_an_earlier_version_did_not_keep_is_added(config: GridConfig) -> None:
-    do(config)
-    files = config.files(Path())
+def test_what_an_earlier_version_did_not_keep_is_added(finished: GridConfig) -> None:
+    files = finished.files(Path())
     (files.kept / "curve.csv").unlink()
     (files.kept / "prediction.json").unlink()
-    do(config)
+    do(finished)
     assert read_curve(files.kept / "curve.csv")
     assert (files.kept / "prediction.json").is_file()
-    assert words(config) == ["started", "finished"]
+    assert words(finished) == ["started", "finished"]
 
 
 def test_a_finished_run_that_was_not_kept_is_kept_and_not_run_again(
-    config: GridConfig,
+    finished: GridConfig,
 ) -> None:
-    do(config)
-    files = config.files(Path())
+    files = finished.files(Path())
     rows = (files.run / "metrics.csv").read_text()
     for path in files.kept.iterdir():
         path.unlink()
-    assert do(config).status is Status.DONE
+    assert do(finished).status is Status.DONE
     assert (files.kept / "metrics.csv").read_text() == rows
 
 
 def test_keeping_marks_the_cell_as_done_last(
-    config: GridConfig, monkeypatch: pytest.MonkeyPatch
+    finished: GridConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    do(config)
-    files = config.files(Path())
+    files = finished.files(Path())
     for path in files.kept.iterdir():
         path.unlink()
     module = sys.modules[keep.__module__]
@@ -140,11 +138,10 @@ def test_a_failed_cell_is_reported_and_run_again_on_request_alone(config: GridCo
     assert not files.failure.exists()
 
 
-def test_a_cell_goes_on_with_its_own_settings_alone(config: GridConfig) -> None:
-    do(config)
-    for path in config.files(Path()).kept.iterdir():
+def test_a_cell_goes_on_with_its_own_settings_alone(finished: GridConfig) -> None:
+    for path in finished.files(Path()).kept.iterdir():
         path.unlink()
-    state = do(replace(config, overrides=(*TINY, "policy.updates=16")))
+    state = do(replace(finished, overrides=(*TINY, "policy.updates=16")))
     assert state.status is Status.FAILED
     assert "policy.updates: 16, not 8" in state.detail
 
@@ -169,11 +166,11 @@ def test_another_process_has_it(config: GridConfig) -> None:
 def test_a_claim_ends_with_its_process(tmp_path: Path) -> None:
     lock = tmp_path / "lock"
     code = (
-        "import time; from pathlib import Path; from grid.claim import claim\n"
+        "import time; from pathlib import Path; from claim import claim\n"  # without torch
         f"with claim(Path({str(lock)!r})): print('mine', flush=True); time.sleep(60)"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", code], cwd=PAPER, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code], cwd=PAPER / "grid", stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "mine\n"
@@ -186,14 +183,18 @@ def test_a_claim_ends_with_its_process(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
-    config: GridConfig, tmp_path: Path
+    config: GridConfig, whole: GridConfig, tmp_path: Path
 ) -> None:
-    whole = replace(config, runs=str(tmp_path / "whole"), results=str(tmp_path / "whole_kept"))
-    assert do(whole).status is Status.DONE
     # Long enough to be caught in the middle: a checkpoint after every unit, and slow evaluations.
     overrides = [*TINY, "checkpoint_interval=0"]
     quoted = ",".join(f'"{override}"' for override in overrides)
-    command = [sys.executable, str(PAPER / "run_grid.py"), "task=pendulum", "share=0.03"]
+    command = [
+        sys.executable,
+        str(PAPER / "run_grid.py"),
+        "task=pendulum",
+        "share=0.03",
+        "allow_dirty=true",
+    ]
     command += [f"runs={config.runs}", f"results={config.results}", f"overrides=[{quoted}]"]
     metrics = config.files(Path()).run / "metrics.csv"
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL) as process:
@@ -210,3 +211,20 @@ def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
     with (config.files(Path()).kept / "metrics.csv").open() as file:
         units = [int(row["unit"]) for row in csv.DictReader(file)]
     assert units == list(range(len(units)))
+
+
+def test_code_that_no_commit_has_is_refused(
+    config: GridConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("grid.worker.describe_origin", lambda seed: {"dirty": True})
+    with pytest.raises(ConfigError, match=r"allow_dirty: expected a tree without uncommitted"):
+        work(replace(config, allow_dirty=False), Path())
+    assert not config.files(Path()).run.exists()
+
+
+def test_a_proof_plays_the_episodes_that_are_kept_for_it(config: GridConfig) -> None:
+    proof = replace(config, allow_dirty=False, proof=True)
+    assert "evaluate.first_seed=2000000" in proof.words()
+    assert not any(word.startswith("evaluate.first_seed") for word in config.words())
+    with pytest.raises(ConfigError, match=r"allow_dirty: expected false with proof=true"):
+        replace(config, proof=True)

@@ -10,23 +10,24 @@ import numpy as np
 import pytest
 import torch
 from kept_runs import make, make_run, results, table
+from scipy import stats
 
-from measures import DEFAULT_SAMPLES
+from measures import DEFAULT_SAMPLES, Between, difference, holm
 from phihp_torchrl import get_task, load_config
 from report import (
     BOUNDS,
     NOT_RUN,
     normalise,
+    published_difference,
     read_run,
     samples_to_90,
-    welch,
+    verdict,
 )
 from report.aggregate import aggregates, profiles, score_matrix
 from report.curves import mean_over_tasks, sample_curves, update_curves
 from report.efficiency import learning_points, sample_efficiency
 from report.learning_curve import learning_curve
 from report.paper_systems import PHIHP, TD3, TD3_IM_PH, system
-from report.significance import welch_published
 from report.time_to_return import seconds_to
 
 
@@ -47,9 +48,9 @@ def test_bounds_are_what_the_rewards_give_at_rest() -> None:
 
 
 def test_samples_to_90_percent() -> None:
-    assert samples_to_90([(100, 449.0), (200, 450.0), (300, 500.0)]) == 200
-    assert samples_to_90([(100, -111.0), (200, -110.0), (300, -100.0)]) == 200
-    assert samples_to_90([(100, -5.0)]) == 100
+    assert samples_to_90([(100, 449.0), (200, 450.0), (300, 500.0)]) == Between(100, 200)
+    assert samples_to_90([(100, -111.0), (200, -110.0), (300, -100.0)]) == Between(100, 200)
+    assert samples_to_90([(100, -5.0)]) == Between(0, 100)
 
 
 def test_a_policy_from_a_model_has_a_point_for_each_number_of_samples(tmp_path: Path) -> None:
@@ -61,7 +62,7 @@ def test_a_policy_from_a_model_has_a_point_for_each_number_of_samples(tmp_path: 
     few, many = found.scores(PHIHP, "pendulum")
     assert learning_points(few) == [(200, -185.0)]
     assert learning_points(many) == [(1000, -120.0)]
-    assert sample_efficiency(found, PHIHP, "pendulum") == (1000.0,)
+    assert sample_efficiency(found, PHIHP, "pendulum") == Between(200, 1000)
     assert sample_curves(found, (PHIHP, TD3), "pendulum") == {
         "PhIHP": [((200, 1000), (-185.0, -120.0))]
     }
@@ -79,7 +80,7 @@ def test_a_policy_from_real_steps_has_a_curve(tmp_path: Path) -> None:
     assert score.run.kind is None
     # The last point is the final evaluation.
     assert learning_points(score) == [(1000, -900.0), (20000, -205.0), (30000, -200.0)]
-    assert sample_efficiency(found, TD3, "pendulum") == (20000.0,)
+    assert sample_efficiency(found, TD3, "pendulum") == Between(1000, 20000)
     assert update_curves(found, "pendulum") == {
         "TD3": [([0.0, 10.0, 20.0], [-900.0, -205.0, -199.0])]
     }
@@ -93,7 +94,7 @@ def test_an_own_run_goes_before_the_part_of_another(tmp_path: Path) -> None:
 
 def test_a_cem_without_samples(tmp_path: Path) -> None:
     make_run(tmp_path, "cem-oracle", samples=0, kind="oracle", acting={"planner": [-200.0]})
-    assert sample_efficiency(results(tmp_path), system("cem-oracle"), "pendulum") == (0.0,)
+    assert sample_efficiency(results(tmp_path), system("cem-oracle"), "pendulum") == Between(0, 0)
 
 
 def test_the_mean_over_tasks_starts_where_all_have_a_return() -> None:
@@ -107,21 +108,55 @@ def test_the_mean_over_tasks_starts_where_all_have_a_return() -> None:
     assert values.tolist() == pytest.approx([0.2, 0.4, 0.9])
 
 
-def test_welch_against_numbers_worked_by_hand() -> None:
-    pytest.importorskip("scipy")
-    # Means 2 and 5, variances 1 and 4: t = -3 / sqrt(1/3 + 4/3).
-    test = welch([1.0, 2.0, 3.0], [3.0, 5.0, 7.0])
-    assert test is not None
-    assert test.t == pytest.approx(-3 / math.sqrt(5 / 3))
-    assert 0.05 < test.p < 0.15
-    assert str(test) == "no difference"
-    assert welch([1.0], [2.0, 3.0]) is None
-    assert str(welch([500.0, 500.0], [400.0, 400.0])) == "higher"
-    assert str(welch([500.0, 500.0], [500.0, 500.0])) == "no difference"
-    published = welch_published("acrobot-swingup", "TD3")
+def test_a_difference_against_numbers_worked_by_hand() -> None:
+    # Means 2 and 5, variances 1 and 4: t = -3 / sqrt(1/3 + 4/3), about 2.94 degrees of freedom.
+    found = difference([1.0, 2.0, 3.0], [3.0, 5.0, 7.0])
+    assert found is not None
+    assert found.mean == pytest.approx(-3.0)
+    error, freedom = math.sqrt(5 / 3), (5 / 3) ** 2 / ((1 / 3) ** 2 / 2 + (4 / 3) ** 2 / 2)
+    half = stats.t.ppf(0.975, freedom) * error
+    assert (found.low, found.high) == pytest.approx((-3 - half, -3 + half))
+    assert found.p == pytest.approx(2 * stats.t.sf(3 / error, freedom))
+    assert verdict(found, found.p, within=None) == "nothing shown"
+    assert verdict(found, 0.01, within=None) == "lower"
+    assert verdict(found, found.p, within=10.0) == "equivalent"
+
+
+def test_there_is_no_p_value_of_few_seeds_or_without_spread() -> None:
+    assert difference([], [1.0]) is None
+    one = difference([1.0], [2.0, 3.0])
+    assert one is not None
+    assert math.isnan(one.low)
+    assert verdict(one, one.p, within=100.0) == "too few seeds"
+    two = difference([1.0, 2.0], [5.0, 6.0, 7.0])
+    assert two is not None
+    assert two.low < two.mean < two.high
+    assert math.isnan(two.p)
+    equal = difference([500.0] * 3, [500.0] * 3)
+    assert equal is not None
+    assert math.isnan(equal.p)
+    assert verdict(equal, equal.p, within=5.0) == "the same in every run"
+    apart = difference([500.0] * 3, [400.0] * 3)  # an infinite t is none
+    assert apart is not None
+    assert math.isnan(apart.p)
+    assert verdict(apart, apart.p, within=5.0) == "nothing shown"
+
+
+def test_the_published_difference() -> None:
+    published = published_difference("acrobot-swingup", "TD3")
     assert published is not None
-    assert published.t == pytest.approx((371 - 119) / math.sqrt((52**2 + 71**2) / 10))
-    assert welch_published("cartpole-swingup", "TD3") is None
+    assert published.mean == 371 - 119
+    t = published.mean / math.sqrt((52**2 + 71**2) / 10)
+    assert published.low > 0
+    assert published.p == pytest.approx(2 * stats.t.sf(t, 16.5), rel=0.1)
+    assert published_difference("cartpole-swingup", "TD3") is None
+
+
+def test_holm_adjusts_a_family_and_leaves_out_what_was_not_tested() -> None:
+    nan = math.nan
+    assert holm([0.04, nan, 0.01]) == pytest.approx([0.04, nan, 0.02], nan_ok=True)
+    assert holm([0.6, 0.7]) == [1.0, 1.0]
+    assert holm([]) == []
 
 
 def test_aggregates_and_profiles_against_numpy() -> None:

@@ -8,11 +8,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from grid_cells import ROOT
 from kept_runs import make_run
 
+from phihp_torchrl import HybridDynamics, get_task
+from phihp_torchrl.agents import Actor, TwinQ
+from phihp_torchrl.deployment import Agent, save_agent
+from phihp_torchrl.planners import CEMConfig
 
-@pytest.mark.usefixtures("drawn")
+PLANNER = CEMConfig(
+    planning_horizon=3, optim_steps=1, num_candidates=8, top_k=2, num_policy_candidates=2,
+    replan_every=2,
+)  # fmt: skip
+"""The planner of the agent that is swept, so small that its episodes take no time."""
+
+
 def test_the_script_makes_the_report_and_logs_its_figures(
     run_script: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -37,7 +46,9 @@ def test_the_script_makes_the_report_and_logs_its_figures(
 def test_sensitivity_is_swept_and_reported(
     run_script: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    agent = ROOT / "results" / "agents" / "pendulum"
+    task = get_task("pendulum")
+    parts = {"actor": Actor(task, (4,)), "qvalue": TwinQ(task, (4,)), "planner_config": PLANNER}
+    agent = save_agent(Agent(task, dynamics=HybridDynamics.hybrid(task), **parts), tmp_path / "a")
     run_script(
         "sensitivity", f"agent={agent}", "episodes=1", "latency_actions=2",
         "planning_horizon=[1,2]", "replan_every=[1,99]", "num_policy_candidates=[0]",
