@@ -54,13 +54,13 @@ class PlanFunctions:
             if None not in self._functions:
                 self._functions[None] = build()
             return self._functions[None](observation, *args)
-        observation, *args = _each((observation, *args), _laid_out)
-        shapes = _each((observation, *args), _signature)
+        inputs = _each((observation, *args), _laid_out)
+        shapes = _each(inputs, _signature)
         function = self._functions.pop(shapes, None) or build()
         self._functions[shapes] = function  # as the last one
         if len(self._functions) > _MOST:
             self._functions.popitem(last=False)
-        return function(observation, *args)
+        return function(*inputs)
 
 
 def _each(arguments: Any, change: Callable[[Tensor], Any]) -> Any:
