@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -40,7 +41,8 @@ def advantage_judge(
             steps.append(step.set(model.reward_key, reward.reshape(shape)))
         # What a reset writes and a step does not, the first one has alone.
         common = set.intersection(*(set(step.keys(True, True)) for step in steps))
-        sequences = torch.stack([step.select(*common) for step in steps], 1).contiguous()
+        sequences: Any = torch.stack([step.select(*common) for step in steps], 1)
+        sequences = sequences.contiguous()
         module(sequences)
         found = sequences.get(key, None)
         if found is None or found.numel() != rows * len(steps):

@@ -109,7 +109,8 @@ class CEMPlanner(SamplingPlanner):
         super().__init__(env, config, cem_plan, None, reward_key, action_key, **options)
 
     def _arrange(self) -> None:
-        s, now = self.settings, self.receding
+        s: Any = self.settings  # which may be wrong still
+        now = self.receding
         if not isinstance(s, CEMConfig):
             pass  # the base class says so
         elif not (s.replan_every > 1 or s.warm_start or s.change_cost > 0):

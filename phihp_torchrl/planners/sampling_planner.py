@@ -158,7 +158,7 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
             raise ConfigError(
                 "env", "expected the one that the planner was made with; make another planner."
             )
-        old = getattr(self, name, None)
+        old: Any = getattr(self, name, None)
         super().__setattr__(name, value)
         if name == "settings" and self.built_in(value) == self.built_in(old):
             return
@@ -211,7 +211,7 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
             return reason
         if self.observation_key is None:
             return "it has several observations and observation_key does not say which to take"
-        base = getattr(self.env, "base_env", self.env)
+        base: Any = getattr(self.env, "base_env", self.env)
         if self.reward_key[1:] != ("reward",) or self._own_done_keys or len(base.reward_keys) > 1:
             return "reward_key or done_keys are not those of its tensor_model"
         if others := set(module_keys(self)) - {self.observation_key}:
