@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.data import Bounded, Composite
 
 from phihp_torchrl.agents import Actor, TwinQ
 from phihp_torchrl.config import ConfigError, kind_mapping, read_kind, resolve_seconds
@@ -108,6 +109,16 @@ class Agent(TensorDictModuleBase):
             self.planner = self._make_planner(planner_config, compile)
         elif actor is None:
             raise ConfigError("actor", "expected one for an agent that does not plan, got None.")
+        remembers = self.planner is not None and self.planner.receding is not None
+        if remembers or self._memory is not None:
+            self.in_keys.append("is_init")
+
+    @property
+    def spec(self) -> Composite:
+        """The spec of the action, ``"action"`` ``[m]`` in physical units."""
+        parameter = next(self.parameters(), torch.zeros(()))
+        low, high = (limit.to(parameter) for limit in self.task.bounds[:2])
+        return Composite(action=Bounded(low=low, high=high, dtype=low.dtype))
 
     def _make_planner(
         self, config: SearchConfig, compile: bool | dict[str, Any]
@@ -117,7 +128,9 @@ class Agent(TensorDictModuleBase):
         world_model = TaskWorldModel(self.task, self.dynamics)
         return make_planner(world_model, self.actor, self.qvalue, config, compile=compile)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def forward(
+        self, tensordict: TensorDictBase, tensordict_out: TensorDictBase | None = None
+    ) -> TensorDictBase:
         """Write ``"action"`` ``[*batch, m]`` for ``"observation"`` ``[*batch, o]``; no gradients.
 
         Where the planner replans every few steps or starts warm, ``"is_init"`` tells it that an
@@ -129,7 +142,13 @@ class Agent(TensorDictModuleBase):
         A task's reference and inputs are read from ``"reference"`` and ``"inputs"``, unless they
         are in the observation: ``[*batch, k]``, or with their preview ``[*batch, rows, k]``. They
         are needed where an episode starts; later steps keep the last value if the key is missing.
+
+        Args:
+            tensordict: the observations.
+            tensordict_out: where the action is written. Defaults to ``tensordict``.
         """
+        if tensordict_out is not None:
+            return tensordict_out.set("action", self.forward(tensordict.copy())["action"])
         with torch.no_grad():
             if self._memory is not None and self._memory.is_asked(tensordict):
                 seen = self._memory.extend(tensordict)

@@ -57,7 +57,7 @@ def write_package(agent: Agent, path: Path) -> None:
         raise AgentError("packaged: expected an agent with a planner, got one without.")
     if reason := planner.why_not_compiled():
         raise AgentError(f"packaged: expected a plan that compiles, but {reason}.")
-    _, arguments, _ = planner.example_call(agent.example())
+    arguments, _ = planner.example_call(agent.example())
     with torch.no_grad():
         program = torch.export.export(_Plan(planner, arguments), _tensors(arguments))
         torch._inductor.aoti_compile_and_package(program, package_path=str(path))
@@ -71,7 +71,7 @@ def use_package(agent: Agent, path: Path) -> None:
     """
     planner = agent.planner
     assert planner is not None
-    key, arguments, eager = planner.example_call(agent.example())
+    arguments, eager = planner.example_call(agent.example())
     loaded = torch._inductor.aoti_load_package(str(path))
     _, spec = pytree.tree_flatten(eager)
 
@@ -86,7 +86,7 @@ def use_package(agent: Agent, path: Path) -> None:
             f"{path}: expected the plan of this agent, of score {eager.score.tolist()}, got one of "
             f"{found.score.tolist()}."
         )
-    planner.replace_plan(key, plan)
+    planner.replace_plan(arguments, plan)
 
 
 def describe(path: Path, identity: str) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -91,8 +92,12 @@ class DynamicsLoss(LossModule):
     def _forward_value_estimator_keys(self, **kwargs) -> None:  # type: ignore[no-untyped-def]
         """This loss has no value estimator."""
 
+    @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss of transitions with any batch shape.
+
+        The tensors may also be given by name (``observation=``, ``action=``,
+        ``next_observation=``); the result is then a tuple in the order of ``out_keys``.
 
         Args:
             tensordict: ``"observation"`` ``[*batch, o]``, ``"action"`` ``[*batch, m]``,

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.modules import WorldModel
 
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.dynamics.hybrid import HybridDynamics
 from phihp_torchrl.dynamics.prepared import PreparedModel
 from phihp_torchrl.tasks import Step, Task, Transition
@@ -50,6 +52,20 @@ class TaskWorldModel(WorldModel):
             decoder=TensorDictModule(task.observe, [("next", "state")], [("next", "observation")]),
         )
         self.task = task
+
+    def decode(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the observation of ``("next", "state")`` under ``"next"``, or else of ``"state"``.
+
+        Raises:
+            ConfigError: for a tensordict with neither.
+        """
+        if tensordict.get(("next", "state"), None) is not None:
+            return super().decode(tensordict)
+        state = tensordict.get("state", None)
+        if state is None:
+            keys = [str(key) for key in tensordict.keys(True, True)]
+            raise ConfigError("state", f"expected 'state' or ('next', 'state'), got {keys}.")
+        return tensordict.set("observation", self.observe(state))
 
     @property
     def transitions(self) -> nn.Module:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.imagination.generator_state import Packed, pack_generator, unpack_generator
+from phihp_torchrl.imagination.given_starts import GivenStarts
+from phihp_torchrl.imagination.latent_model_env import LatentModelEnv
 from phihp_torchrl.imagination.rollouts import (
     ChunkNoise,
     Policy,

@@ -9,14 +9,20 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
 from torchrl.envs.model_based import ModelBasedEnvBase
 from torchrl.envs.model_based import WorldModelEnv as StockWorldModelEnv
+from torchrl.modules import WorldModel
 
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.imagination.generator_state import pack_generator, unpack_generator
+from phihp_torchrl.imagination.given_starts import GivenStarts
+from phihp_torchrl.imagination.latent_model_env import LatentModelEnv
 from phihp_torchrl.imagination.start_states import BoxStates, StartStates, TaskStates
 
 
-class WorldModelEnv(StockWorldModelEnv):
+class WorldModelEnv(GivenStarts, StockWorldModelEnv):
     """A TorchRL environment that steps a :class:`~phihp_torchrl.dynamics.TaskWorldModel`.
 
     Besides ``"observation"`` a tensordict has ``"state"``, the state of the model, which is kept in
@@ -34,8 +40,8 @@ class WorldModelEnv(StockWorldModelEnv):
 
     For models of a known task it corrects :class:`torchrl.envs.model_based.WorldModelEnv`, whose
     specs lack the batch size, whose auto-resets lose the latent state, and which has no
-    termination. Other :class:`~torchrl.modules.WorldModel` instances have neither specs nor start
-    states; subclass :class:`~torchrl.envs.ModelBasedEnvBase` for them.
+    termination. :meth:`from_world_model` makes an environment of any other
+    :class:`~torchrl.modules.WorldModel`.
 
     Args:
         world_model: the task's model; later changes of its parameters take effect at once.
@@ -46,6 +52,7 @@ class WorldModelEnv(StockWorldModelEnv):
 
     Raises:
         TypeError: for a world model that is not a :class:`TaskWorldModel`.
+        ConfigError: for a batch size with a 0 in it.
         ValueError: from ``reset`` and ``step``, for an action, observation or state of the wrong
             shape, dtype or device, and for a start that is not finite; the message names the key.
 
@@ -58,7 +65,10 @@ class WorldModelEnv(StockWorldModelEnv):
         torch.Size([64, 10, 3])
     """
 
-    _supports_set_state = True
+    computed_keys = ("state",)
+    """Keys that a step computes from the observation where they are missing."""
+    computed_from = ("observation",)
+    """The keys that it computes them from."""
 
     def __init__(
         self,
@@ -72,11 +82,13 @@ class WorldModelEnv(StockWorldModelEnv):
         if not isinstance(world_model, TaskWorldModel):
             raise TypeError(
                 f"world_model: expected a TaskWorldModel, got {type(world_model).__name__}; "
-                "subclass torchrl.envs.model_based.ModelBasedEnvBase for other world models."
+                "WorldModelEnv.from_world_model takes other world models."
             )
         if device is None:
             tensors = [*world_model.parameters(), *world_model.buffers()]
             device = tensors[0].device if tensors else "cpu"
+        if 0 in (sizes := tuple(batch_size)):
+            raise ConfigError("batch_size", f"expected sizes of one and more, got {list(sizes)}.")
         # The stock __init__ copies the specs of a reference env; here the task knows them.
         ModelBasedEnvBase.__init__(
             self, world_model.step_module, device=device, batch_size=torch.Size(batch_size)
@@ -94,6 +106,35 @@ class WorldModelEnv(StockWorldModelEnv):
         self._set_seed(seed)
         self._set_specs()
 
+    @classmethod
+    def from_world_model(
+        cls, world_model: WorldModel, base_env: EnvBase | None = None, **options: Any
+    ) -> EnvBase:
+        """Make an environment of any world model, for planners and rollouts.
+
+        Args:
+            world_model: a :class:`TaskWorldModel`, or another :class:`torchrl.modules.WorldModel`.
+            base_env: an environment with the specs of action, reward and flags, and with the
+                observations that the encoder reads; not needed for a :class:`TaskWorldModel`.
+            options: further arguments of this class, or for other world models ``start`` and
+                ``done`` of :class:`~phihp_torchrl.imagination.LatentModelEnv`.
+
+        Returns:
+            A ``WorldModelEnv``, or for other world models an environment that steps in latents.
+
+        Raises:
+            ConfigError: for another world model without a ``base_env`` that fits.
+        """
+        if isinstance(world_model, TaskWorldModel):
+            return cls(world_model, **options)
+        if base_env is None:
+            raise ConfigError(
+                "base_env",
+                f"expected an environment with the specs of a {type(world_model).__name__}, "
+                "got none.",
+            )
+        return LatentModelEnv(world_model, base_env, **options)
+
     @property
     def tensor_model(self) -> TaskWorldModel:
         """The model, with ``locate``, ``observe`` and ``transition`` as functions of tensors."""
@@ -101,9 +142,10 @@ class WorldModelEnv(StockWorldModelEnv):
 
     def _set_specs(self) -> None:
         task, batch, device = self.tensor_model.task, self.batch_size, self.device
+        self._dtype = dtype = _dtype_of(self.tensor_model)
 
         def vector(size: int) -> Unbounded:
-            return Unbounded(shape=(*batch, size), device=device)
+            return Unbounded(shape=(*batch, size), device=device, dtype=dtype)
 
         def situation() -> Composite:
             return Composite(
@@ -115,10 +157,22 @@ class WorldModelEnv(StockWorldModelEnv):
 
         self.observation_spec = situation()
         self.state_spec = situation()  # the keys from which a step or a reset may start
-        low, high = (limit.to(device).expand(*batch, -1) for limit in task.bounds[:2])
-        self.action_spec = Bounded(low=low, high=high)
+        low, high = (limit.to(device, dtype).expand(*batch, -1) for limit in task.bounds[:2])
+        self.action_spec = Bounded(low=low, high=high, dtype=dtype)
         self.reward_spec = vector(1)
         self.done_spec = Binary(shape=(*batch, 1), device=device, dtype=torch.bool)
+
+    def _apply(self, *args: Any, **kwargs: Any) -> WorldModelEnv:
+        super()._apply(*args, **kwargs)
+        if self._dtype != _dtype_of(self.tensor_model):  # as after double()
+            self._set_specs()
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "generator": pack_generator(self.generator)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__({**state, "generator": unpack_generator(state["generator"])})
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
@@ -141,23 +195,9 @@ class WorldModelEnv(StockWorldModelEnv):
                 raise ValueError("state: expected finite states to start from, got others.")
         else:
             batch = self.batch_size if tensordict is None else tensordict.batch_size
-            state = self.start_states.sample(batch, self.generator, self.device)
+            state = self.start_states.sample(batch, self.generator, self.device).to(self._dtype)
             self._checked("start_states", state, batch, self.tensor_model.task.state_dim)
         return self._result(state, torch.zeros_like(state[..., 0], dtype=torch.bool))
-
-    def _input_td_has_state(self, tensordict: TensorDictBase | None) -> bool:
-        # A mask selects rows whose episode has ended, so their state in the tensordict is old.
-        if tensordict is None or "_reset" in tensordict:
-            return False
-        return super()._input_td_has_state(tensordict)
-
-    def _resolve_set_state(
-        self, set_state: bool | None, tensordict: TensorDictBase | None, select_reset_only: bool
-    ) -> bool | None:
-        # A state in the tensordict is used without set_state=True, as in the stock class.
-        if set_state is None and not select_reset_only:
-            set_state = self._input_td_has_state(tensordict)
-        return super()._resolve_set_state(set_state, tensordict, select_reset_only)
 
     def _result(self, state: Tensor, terminated: Tensor) -> TensorDict:
         terminated = terminated.unsqueeze(-1)
@@ -186,9 +226,15 @@ class WorldModelEnv(StockWorldModelEnv):
         shape = (*batch, size)
         if value is None:
             raise ValueError(f"{key}: expected a tensor of shape {list(shape)}, got none.")
-        if (value.shape, value.dtype, value.device) != (shape, torch.float32, self.device):
+        if (value.shape, value.dtype, value.device) != (shape, self._dtype, self.device):
             raise ValueError(
-                f"{key}: expected torch.float32 of shape {list(shape)} on {self.device}, "
+                f"{key}: expected {self._dtype} of shape {list(shape)} on {self.device}, "
                 f"got {value.dtype} of shape {list(value.shape)} on {value.device}."
             )
         return value
+
+
+def _dtype_of(model: TaskWorldModel) -> torch.dtype:
+    """The dtype of a model's parameters, or float32 for a model without."""
+    tensors = [*model.parameters(), *model.buffers()]
+    return next((t.dtype for t in tensors if t.is_floating_point()), torch.float32)

@@ -81,10 +81,11 @@ def score_pool(
         completed: number of sequences after these whose last action is the actor's.
     """
     shape = actions.shape
-    repeated = state.expand(shape[1], *state.shape).reshape(-1, *state.shape[1:])
+    count = shape[1] * shape[2]
+    repeated = state.expand(shape[1], *state.shape).reshape(count, *state.shape[1:])
     scores, actions = score_sequences(
         repeated,
-        actions.reshape(shape[0], -1, shape[-1]),
+        actions.reshape(shape[0], count, shape[-1]),
         problem,
         gamma=settings.gamma,
         alpha=settings.alpha,

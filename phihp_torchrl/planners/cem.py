@@ -149,10 +149,10 @@ def cem_plan(
     """
     s, bounds = settings, problem.bounds
     batch, action_dim = noise.shape[3:-1], noise.shape[-1]
-    noise = noise.reshape(*noise.shape[:3], -1, action_dim)
-    rows = noise.shape[3]
+    rows = batch.numel()
+    noise = noise.reshape(*noise.shape[:3], rows, action_dim)
     state = problem.model.locate(observation)
-    state = state.reshape(-1, *state.shape[len(batch) :])
+    state = state.reshape(rows, *state.shape[len(batch) :])
 
     start = None if mean is None else to_pool_layout(mean, rows)
     center = bounds.center.expand(s.planning_horizon, 1, rows, action_dim)

@@ -78,6 +78,7 @@ class CEMPlanner(SamplingPlanner):
     """
 
     settings: CEMConfig
+    settings_class = CEMConfig
 
     def __init__(
         self,
@@ -104,19 +105,19 @@ class CEMPlanner(SamplingPlanner):
             top_k=top_k,
             **{"num_policy_candidates": most, **settings},
         )
-        remembers = config.replan_every > 1 or config.warm_start or config.change_cost > 0
-        receding = RecedingHorizon(config.replan_every, config.warm_start) if remembers else None
-        super().__init__(
-            env,
-            config,
-            cem_plan,
-            receding,
-            reward_key,
-            action_key,
-            actor=actor,
-            qvalue=qvalue,
-            **options,
-        )
+        options.update(actor=actor, qvalue=qvalue)
+        super().__init__(env, config, cem_plan, None, reward_key, action_key, **options)
+
+    def _arrange(self) -> None:
+        s: Any = self.settings  # which may be wrong still
+        now = self.receding
+        if not isinstance(s, CEMConfig):
+            pass  # the base class says so
+        elif not (s.replan_every > 1 or s.warm_start or s.change_cost > 0):
+            self.receding = None
+        elif now is None or (now.replan_every, now.warm_start) != (s.replan_every, s.warm_start):
+            self.receding = RecedingHorizon(s.replan_every, s.warm_start)
+        super()._arrange()
 
     @classmethod
     def from_config(cls, env: EnvBase, config: CEMConfig, **options: Any) -> CEMPlanner:
@@ -137,7 +138,7 @@ class CEMPlanner(SamplingPlanner):
         batch = tensordict.batch_size
         if self.receding is None:
             actions = self.plan(tensordict, noise).actions
-            return actions[..., 0, :].reshape(*batch, *self.action_spec.shape)
+            return actions[..., 0, :].reshape((*batch, *self.action_spec.shape))
         starts, center = self._starts(tensordict), self.bounds.center
         last = self.receding.last_action(starts, center.expand(*batch, -1))
         action = self.receding.act(
@@ -147,7 +148,7 @@ class CEMPlanner(SamplingPlanner):
             center.expand(self.settings.planning_horizon, -1),
         )
         self.receding.record(action)
-        return action.reshape(*batch, *self.action_spec.shape)
+        return action.reshape((*batch, *self.action_spec.shape))
 
     @torch.no_grad()
     def plan(

@@ -11,6 +11,8 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
+from phihp_torchrl.config import ConfigError
+
 
 class EnvModel:
     """A stateless TorchRL environment with the interface of a tensor model; states are tensordicts.
@@ -51,30 +53,55 @@ class EnvModel:
     def transition(
         self, state: TensorDictBase, action: Tensor
     ) -> tuple[TensorDictBase, Tensor, Tensor]:
-        """Step the environment, ``[rows]``."""
-        state = state.copy().set(self.action_key, action.reshape(-1, *self.action_shape))
+        """Step the environment, ``[rows]``, as :meth:`take` does."""
+        return self.take(state, action)[1:]
+
+    def take(
+        self, state: TensorDictBase, action: Tensor
+    ) -> tuple[TensorDictBase, TensorDictBase, Tensor, Tensor]:
+        """Step the environment; return the step, the next state, reward and end ``[rows]``.
+
+        Rewards of whole numbers become those of the action's dtype, and flags become bools.
+
+        Raises:
+            ConfigError: for a reward or a flag that is not one number for each row.
+        """
+        rows = action.shape[0]
+        # Copied whole: an environment may work in place, and candidates share one first state.
+        state = state.copy().set(self.action_key, action.reshape(rows, *self.action_shape)).clone()
         state = self.env.step(state)
-        reward = state.get(self.reward_key).reshape(-1)
+        reward = self._one_each(state, self.reward_key, rows)
+        reward = reward if reward.is_floating_point() else reward.to(action.dtype)
         over = torch.zeros_like(reward, dtype=torch.bool)
         for key in self.done_keys:
-            over = over | state.get(key).reshape(-1)
+            over = over | self._one_each(state, key, rows).to(torch.bool)
         next_state = step_mdp(
             state,
             reward_keys=self.env.reward_keys,
             done_keys=self.env.done_keys,
             action_keys=self.env.action_keys,
         )
-        return next_state, reward, over
+        return state, next_state, reward, over
+
+    def _one_each(self, state: TensorDictBase, key: NestedKey, rows: int) -> Tensor:
+        value = state.get(key)
+        if value.numel() != rows:
+            raise ConfigError(
+                "env", f"expected one {key!r} for each of {rows} rows, got {list(value.shape)}."
+            )
+        return value.reshape(rows)
 
 
 def find_action(env: EnvBase, key: NestedKey) -> TensorSpec:
     """Return the spec of the only, continuous action ``key``, without the batch size."""
     keys = [unravel_key(k) for k in env.action_keys]
     if keys != [key]:
-        raise ValueError(f"action_key: expected the only action of {keys}, got {key!r}.")
+        raise ConfigError("action_key", f"expected the only action of {keys}, got {key!r}.")
     spec = env.full_action_spec_unbatched[key]
-    if not spec.dtype.is_floating_point:
-        raise ValueError(f"env: expected continuous actions, got {spec.dtype}.")
+    if not spec.dtype.is_floating_point or spec.domain == "discrete":
+        raise ConfigError(
+            "env", f"expected continuous actions, got {spec.dtype} of a {type(spec).__name__}."
+        )
     return spec
 
 
@@ -101,16 +128,24 @@ def find_reward(env: EnvBase, key: NestedKey) -> NestedKey:
 
 
 def find_done(env: EnvBase, keys: NestedKey | Sequence[NestedKey] | None) -> list[NestedKey]:
-    """Return the keys of the flags that end a sequence, with the leading ``"next"``."""
+    """Return the keys of the flags that end a sequence, with the leading ``"next"``.
+
+    A key may be given without the leading ``"next"`` too.
+    """
     known = [unravel_key(("next", k)) for k in env.done_keys]
     if keys is None:
         return [key for key in known if key[-1] == "terminated"]
-    if isinstance(keys, str) or (isinstance(keys, tuple) and unravel_key(keys) in known):
+    if isinstance(keys, str) or (isinstance(keys, tuple) and _named(keys, known) in known):
         keys = [keys]
-    keys = [unravel_key(key) for key in keys]
+    keys = [_named(key, known) for key in keys]
     if unknown := [key for key in keys if key not in known]:
         raise ValueError(f"done_keys: expected some of {known}, got {unknown}.")
     return keys
+
+
+def _named(key: NestedKey, known: Sequence[NestedKey]) -> NestedKey:
+    following = unravel_key(("next", key))
+    return following if following in known else unravel_key(key)
 
 
 def find_situation(env: EnvBase) -> dict[NestedKey, TensorSpec]:

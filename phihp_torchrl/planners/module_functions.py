@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
+
+from phihp_torchrl.config import ConfigError
 
 
 def tensor_function(
@@ -73,15 +75,30 @@ def _has_hooks(module: torch.nn.Module) -> bool:
 
 
 def actor_function(
-    module: TensorDictModuleBase, action_key: NestedKey, action_dim: int, *, prepared: bool = False
+    module: TensorDictModuleBase,
+    action_key: NestedKey,
+    action_shape: torch.Size,
+    *,
+    prepared: bool = False,
 ) -> Callable[[Any], Tensor]:
-    """Make a function from observation (tensor or tensordict) to action ``[rows, m]``."""
+    """Make a function from observation (tensor or tensordict) to action ``[rows, m]``.
+
+    Raises:
+        ConfigError: when called, if the actor does not write one action for each row.
+    """
     function = tensor_function(module, action_key, prepared=prepared)
     keys = list(module.in_keys)
 
     def act(observation: Any) -> Tensor:
-        action = function(*(_read(observation, key) for key in keys))
-        return action.reshape(-1, action_dim)
+        inputs = [_read(observation, key) for key in keys]
+        action, rows = function(*inputs), _rows(inputs)
+        if action.shape[:1] != (rows,) or action.numel() != rows * action_shape.numel():
+            raise ConfigError(
+                "actor",
+                f"expected {action_key!r} of shape {[rows, *action_shape]} for {rows} rows, "
+                f"got {list(action.shape)}.",
+            )
+        return action.reshape(rows, action_shape.numel())
 
     return act
 
@@ -94,21 +111,42 @@ def value_function(
     *,
     prepared: bool = False,
 ) -> Callable[[Any, Tensor], Tensor]:
-    """Make a function from observation and action ``[rows, m]`` to min(Q1, Q2) ``[rows]``."""
+    """Make a function from observation and action ``[rows, m]`` to min(Q1, Q2) ``[rows]``.
+
+    Raises:
+        ConfigError: when called, if the critic does not write values of a shape that
+            :func:`smallest` reads.
+    """
     function = tensor_function(module, value_key, prepared=prepared)
     keys = list(module.in_keys)
 
     def value(observation: Any, action: Tensor) -> Tensor:
-        action = action.reshape(-1, *action_shape)
-        inputs = (action if key == action_key else _read(observation, key) for key in keys)
-        return smallest(function(*inputs))
+        action = action.reshape(action.shape[0], *action_shape)
+        inputs = [action if key == action_key else _read(observation, key) for key in keys]
+        return smallest(function(*inputs), _rows(inputs), value_key)
 
     return value
 
 
-def smallest(values: Tensor) -> Tensor:
-    """Reduce values ``[rows, critics]`` or ``[critics, rows, 1]`` to the smallest, ``[rows]``."""
-    return values.amin(-1) if values.ndim == 2 else values.squeeze(-1).amin(0)
+def smallest(values: Tensor, rows: int, key: NestedKey = "state_action_value") -> Tensor:
+    """Reduce values ``[rows, critics]`` or ``[critics, rows, 1]`` to the smallest, ``[rows]``.
+
+    Raises:
+        ConfigError: for values of another shape, which would become the same for all rows.
+    """
+    if values.ndim == 2 and values.shape[0] == rows:
+        return values.amin(-1)
+    if values.ndim == 3 and values.shape[1:] == (rows, 1):
+        return values.squeeze(-1).amin(0)
+    raise ConfigError(
+        "qvalue",
+        f"expected {key!r} of shape [{rows}, critics] or [critics, {rows}, 1] for {rows} rows, "
+        f"got {list(values.shape)}.",
+    )
+
+
+def _rows(inputs: Sequence[Tensor]) -> int:
+    return inputs[0].shape[0]
 
 
 def _read(observation: Any, key: NestedKey) -> Tensor:

@@ -155,10 +155,10 @@ def mppi_plan(
     s, bounds = settings, problem.bounds
     horizon, action_dim = noise.samples.shape[1], noise.samples.shape[-1]
     batch = noise.samples.shape[3:-1]
-    samples = noise.samples.flatten(3, -2) if batch else noise.samples.unsqueeze(3)
-    rows = samples.shape[3]
+    rows = batch.numel()
+    samples = noise.samples.reshape(*noise.samples.shape[:3], rows, action_dim)
     state = problem.model.locate(observation)
-    state = state.reshape(-1, *state.shape[len(batch) :])
+    state = state.reshape(rows, *state.shape[len(batch) :])
 
     last = None if last is None else last.reshape(rows, action_dim)
     center = bounds.center.expand(horizon, 1, rows, action_dim)
@@ -168,7 +168,7 @@ def mppi_plan(
 
     guided = None
     if s.num_policy_candidates:
-        policy_noise = noise.policy.reshape(horizon, -1, rows, action_dim)
+        policy_noise = noise.policy.reshape(horizon, s.num_policy_candidates, rows, action_dim)
         guided = _policy_candidates(state, policy_noise, last, problem, s)
     rescue = fallback(state, None if guided is None else guided.first(1), center, problem)
     for iteration_noise in samples.unbind(0):

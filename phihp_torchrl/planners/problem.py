@@ -42,6 +42,8 @@ class Problem:
             or ``None``.
         value: a function from observation and action to min(Q1, Q2) ``[rows]``, or ``None``. Needs
             an actor.
+        judge: a function from first states and actions ``[H, rows, m]`` to scores ``[rows]``, which
+            takes the place of equation 4 where there are no candidates of an actor; or ``None``.
 
     Examples:
         >>> from phihp_torchrl import HybridDynamics, get_task
@@ -58,6 +60,7 @@ class Problem:
     bounds: ActionBounds
     actor: Callable[[Any], Tensor] | None = None
     value: Callable[[Any, Tensor], Tensor] | None = None
+    judge: Callable[[Any, Tensor], Tensor] | None = None
 
 
 def score_sequences(
@@ -102,6 +105,9 @@ def score_sequences(
         ``[H, rows, m]``.
     """
     model, actor = problem.model, problem.actor
+    if problem.judge is not None:
+        scores = problem.judge(state, actions)
+        return torch.nan_to_num(scores, *(float("-inf"),) * 3), actions
     guide = _Guide(problem, policy_noise, completed, len(actions)) if actor is not None else None
     roll_out = _at_once if hasattr(model, "judge") else _step_by_step
     rolled = roll_out(state, actions, problem, guide, gamma, change_cost, last)

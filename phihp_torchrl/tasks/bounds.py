@@ -23,8 +23,9 @@ class ActionBounds(NamedTuple):
     Args:
         low: lower bounds.
         high: upper bounds.
-        center: the middle; zero where there is no bound.
-        scale: the half-range; one where there is no bound.
+        center: the middle; where a bound is missing, zero, or if that is nearer to the other bound
+            than one, the value at a distance of one from it.
+        scale: the half-range; one where a bound is missing.
 
     Examples:
         >>> bounds = ActionBounds.from_limits(torch.tensor([0.0]), torch.tensor([100.0]))
@@ -41,11 +42,17 @@ class ActionBounds(NamedTuple):
     def from_limits(
         cls, low: Tensor | Sequence[float], high: Tensor | Sequence[float]
     ) -> ActionBounds:
-        """Bounds ``[m]`` with their middle and half-range; limits may be infinite."""
+        """Bounds ``[m]`` with their middle and half-range.
+
+        Limits may be infinite, or the largest numbers of their dtype, which stand for no limit too.
+        """
         low, high = torch.as_tensor(low), torch.as_tensor(high)
         half = high / 2 - low / 2
-        bounded = half.isfinite()
-        center = torch.where(bounded, low / 2 + high / 2, torch.zeros_like(half))
+        most = torch.finfo(half.dtype).max
+        bounded = (low > -most) & (high < most)
+        # With one bound alone, samples around zero would all be clipped to a bound above it.
+        inside = torch.zeros_like(half).clamp(low + 1, high - 1)
+        center = torch.where(bounded, low / 2 + high / 2, inside)
         return cls(low, high, center, torch.where(bounded, half, torch.ones_like(half)))
 
     def clip(self, action: Tensor) -> Tensor:

@@ -11,15 +11,17 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from phihp_torchrl.imagination import GivenStarts
 from phihp_torchrl.tasks import ActionBounds
 
 
-class LatentEnv(EnvBase):
+class LatentEnv(GivenStarts, EnvBase):
     """Steps a model of latents as if it were the world; the observation is ``"latent"``.
 
     It accepts tensordicts of any batch shape, and its ``tensor_model`` lets planners call the model
     as functions. Put an encoder before the planner:
-    ``TensorDictSequential(encoder, MPPIPlanner(env, ...))``.
+    ``TensorDictSequential(encoder, MPPIPlanner(env, ...))``. ``reset(tensordict)`` starts from the
+    ``"latent"`` given there, unless ``set_state=False`` or a ``"_reset"`` mask asks for fresh ones.
 
     Args:
         model: with ``transition(latent, action) -> next latent, reward, terminated``, and
@@ -77,9 +79,12 @@ class LatentEnv(EnvBase):
         )
         return self._result(latent, terminated).set("reward", reward.unsqueeze(-1))
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, set_state: bool = False, **_: Any
+    ) -> TensorDictBase:
         batch = self.batch_size if tensordict is None else tensordict.batch_size
-        latent = self.start(batch)
+        given = tensordict if set_state else None
+        latent = self.start(batch) if given is None else given.get("latent").clone()
         return self._result(latent, torch.zeros_like(latent[..., 0], dtype=torch.bool))
 
     def _result(self, latent: Tensor, terminated: Tensor) -> TensorDict:

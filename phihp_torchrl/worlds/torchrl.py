@@ -24,6 +24,7 @@ from phihp_torchrl.tasks import Task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.command_memory import command_memory
 from phihp_torchrl.worlds.constraint_end import ConstraintEnd
+from phihp_torchrl.worlds.open_limits import open_limits
 from phihp_torchrl.worlds.signal_source import signal_source
 
 
@@ -123,7 +124,7 @@ def fit_env(task: Task, env: EnvBase) -> EnvBase:
             was found.
     """
     check_keys(task, env)
-    transforms = []
+    transforms = open_limits(env)
     doubles = [
         key
         for key in ("observation", "reward")

@@ -7,11 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 from lopsided import LOPSIDED
+from spawned import send
 from tensordict import TensorDict
 
-from phihp_torchrl import Agent, CEMPlanner, MPPIPlanner, get_task
+from phihp_torchrl import Agent, CEMPlanner, HybridDynamics, MPPIPlanner, get_task
 from phihp_torchrl.agents import Actor, make_actor
-from phihp_torchrl.planners import MPPIConfig
+from phihp_torchrl.planners import CEMConfig, MPPIConfig
 from phihp_torchrl.worlds import SimulatedWorld
 
 from .agent_parts import SMALL, act, make_agent, observations
@@ -125,3 +126,19 @@ def test_bad_observations_are_named(planner):
             agent(TensorDict({"observation": bad}, batch_size=[3]))
     with pytest.raises(ValueError, match="observation: expected"):
         agent(TensorDict(batch_size=[3]))
+
+
+def test_keys_out_and_spec_are_those_of_a_tensordict_module():
+    task = get_task("pendulum")
+    agent = Agent(task, actor=Actor(task))
+    given = TensorDict(observation=task.observe(task.reset.sample([2])), batch_size=[2])
+    out = TensorDict(batch_size=[2])
+    assert agent(given, tensordict_out=out) is out
+    assert list(given.keys()) == ["observation"]
+    assert torch.equal(out["action"], agent(given.clone())["action"])
+    assert agent.spec["action"].is_in(out["action"][0])
+    assert agent.in_keys == ["observation"]
+    warm = CEMConfig(planning_horizon=2, num_policy_candidates=0, warm_start=True)
+    planning = Agent(task, dynamics=HybridDynamics.hybrid(task), planner_config=warm)
+    assert planning.in_keys == ["observation", "is_init"]
+    assert torch.equal(send(planning).spec["action"].high, torch.tensor([2.0]))

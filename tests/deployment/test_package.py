@@ -73,9 +73,9 @@ def test_a_packaged_plan_is_the_eager_one(directory, caplog):
     eager, packaged = load_agent(directory), load_agent(directory, packaged=True)
     assert not ours(caplog)
     calls = []
-    (key,) = packaged.planner._planning_functions
-    used = packaged.planner._planning_functions[key]
-    packaged.planner.replace_plan(key, lambda *args: (calls.append(0), used(*args))[1])
+    (used,) = packaged.planner._functions._replaced.values()
+    arguments, _ = packaged.planner.example_call(packaged.example())
+    packaged.planner.replace_plan(arguments, lambda *args: (calls.append(0), used(*args))[1])
     for seed in range(3):
         torch.testing.assert_close(act(packaged, seed), act(eager, seed), atol=1e-4, rtol=1e-4)
     assert calls == [0] * 3

@@ -272,3 +272,15 @@ def test_gradients_reach_prior_and_residual_alike():
     for name, parameter in loss.dynamics.named_parameters():
         assert parameter.grad.isfinite().all(), name
         assert parameter.grad.abs().max() > 0, name
+
+
+def test_tensors_may_be_given_by_name():
+    task = get_task("pendulum")
+    loss = DynamicsLoss(HybridDynamics.hybrid(task))
+    seen, following = task.observe(task.reset.sample([2, 8])).unbind(0)
+    action = torch.ones(8, 1)
+    following_td = TensorDict(observation=following, batch_size=[8])
+    data = TensorDict(observation=seen, action=action, next=following_td, batch_size=[8])
+    expected = loss(data)
+    found = loss(observation=seen, action=action, next_observation=following)
+    assert [float(value) for value in found] == [float(expected[key]) for key in loss.out_keys]

@@ -96,3 +96,15 @@ def test_it_says_whether_it_compiles(integrator, compiles):
     task = get_task("pendulum")
     model = TaskWorldModel(task, HybridDynamics.pure_prior(task, integrator=integrator))
     assert model.compiles == compiles
+
+
+def test_decode_reads_the_next_state_or_the_state():
+    task = get_task("pendulum")
+    model = TaskWorldModel(task, HybridDynamics.hybrid(task))
+    state = torch.tensor([[0.3, 1.0]])
+    now = model.decode(TensorDict(state=state, batch_size=[1]))
+    assert torch.equal(now["observation"], task.observe(state))
+    following = TensorDict(next=TensorDict(state=state, batch_size=[1]), batch_size=[1])
+    assert torch.equal(model.decode(following)["next", "observation"], task.observe(state))
+    with pytest.raises(ValueError, match=r"^state: expected 'state' or \('next', 'state'\)"):
+        model.decode(TensorDict(observation=task.observe(state), batch_size=[1]))

@@ -388,6 +388,11 @@ def test_bad_reset_is_named():
         make_env(batch_size=[3], start_states=BoxStates(Box((0.0,), (1.0,)))).reset()
 
 
+def test_an_empty_batch_is_refused():
+    with pytest.raises(ValueError, match=r"batch_size: .* got \[3, 0\]"):
+        make_env(batch_size=[3, 0])
+
+
 def test_other_world_models_are_refused():
     with pytest.raises(TypeError, match="world_model: expected a TaskWorldModel, got Linear"):
         WorldModelEnv(nn.Linear(1, 1))

@@ -11,7 +11,18 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv, InitTracker, PendulumEnv, RewardScaling, TransformedEnv
+from torchrl.envs import (
+    ActionScaling,
+    Compose,
+    EnvBase,
+    GymEnv,
+    InitTracker,
+    ObservationNorm,
+    PendulumEnv,
+    RewardScaling,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.envs.model_based import ModelBasedEnvBase
 from torchrl.modules import MLP, MPCPlannerBase, WorldModel
 
@@ -176,14 +187,34 @@ def test_an_encoder_before_the_planner():
     assert base.rollout(3, policy)["action"].shape == (3, 1)
 
 
-def test_transforms_are_not_lost(caplog):
-    """A transformed environment is stepped, though its base could do without."""
+@pytest.mark.parametrize("backend", ["auto", "env"])
+def test_transforms_are_not_lost(backend, caplog):
+    """Rewards are scaled; what only counts steps is left out, and needs no key in the plan."""
+    _, env, _, _ = task_parts("pendulum")
+    plain = make_planner(env)
+    scaled = TransformedEnv(env, Compose(StepCounter(), RewardScaling(1e3, 2.0)))
+    with caplog.at_level(logging.INFO, logger="phihp_torchrl"):
+        planner = make_planner(scaled, backend=backend)
+    assert planner.uses_tensors == (backend == "auto")
+    assert len(caplog.records) == (backend == "env")
+    start = env.reset() if backend == "auto" else scaled.reset()
+    noise = noise_for(planner)
+    bare, found = plain.plan(start, noise), planner.plan(start, noise)
+    gamma, horizon = plain.settings.gamma, plain.settings.planning_horizon
+    offset = 1e3 * sum(gamma**k for k in range(horizon))
+    torch.testing.assert_close(found.score, 2.0 * bare.score + offset)
+
+
+def test_other_transforms_are_stepped(caplog):
     _, env, _, _ = task_parts("pendulum")
     with caplog.at_level(logging.INFO, logger="phihp_torchrl"):
-        planner = make_planner(TransformedEnv(env, RewardScaling(1e3, 1.0)))
+        planner = make_planner(TransformedEnv(env, ActionScaling()))
     assert not planner.uses_tensors
     assert [record.getMessage() for record in caplog.records] == [
-        "CEMPlanner steps the environment: TransformedEnv has no tensor_model of its own."
+        "CEMPlanner steps the environment: its ActionScaling may change more than the reward."
     ]
-    start = env.reset()
-    assert planner.plan(start, noise_for(planner)).score > 1e3
+    assert planner.in_keys == ["observation"], "the state is computed where it is missing"
+    action = planner(env.reset().select("observation"))["action"]
+    assert action.abs() <= 1.0
+    changed = TransformedEnv(env, ObservationNorm(0.0, 2.0, in_keys=["observation"]))
+    assert make_planner(changed).in_keys == ["observation", "state"]

@@ -15,7 +15,7 @@ from torchrl.envs import check_env_specs
 from phihp_torchrl import MPPIPlanner
 from phihp_torchrl.planners import MPPIConfig
 from phihp_torchrl.tasks import ActionBounds
-from phihp_torchrl.tdmpc import LatentEnv, ScheduledMPPIConfig, make_latent_planner
+from phihp_torchrl.tdmpc import TOLD, LatentEnv, ScheduledMPPIConfig, make_latent_planner
 
 from .told_parts import make_told
 
@@ -80,8 +80,23 @@ def test_plans_among_latents_stay_in_lopsided_bounds():
     )
     planner = make_latent_planner(make_told(bounds=LOPSIDED.bounds), settings)
     assert planner.uses_tensors
-    assert planner.in_keys == ["latent"]
+    assert planner.in_keys == ["latent", "is_init"]
     actions = planner.plan(TensorDict(latent=torch.randn(200, 6), batch_size=[200])).actions
     assert actions.shape == (200, 3, 1)
     assert actions.min().item() == -6.0
     assert actions.max().item() == 12.0
+
+
+def test_a_latent_env_starts_from_the_latents_given():
+    told = TOLD(3, ActionBounds.from_limits([-2.0], [2.0]))
+    env = make_latent_planner(told, MPPIConfig(num_candidates=8, top_k=2)).env
+    latent = torch.randn(3, told.config.latent_dim)
+    given = TensorDict(latent=latent, batch_size=[3])
+    assert torch.equal(env.reset(given)["latent"], latent)
+    assert torch.equal(env.rollout(2, tensordict=given)["latent"][:, 0], latent)
+    assert not env.reset(given, set_state=False)["latent"].any()
+    old = env.step(env.rand_action(env.reset(given)))["next"].exclude("reward")
+    mask = torch.tensor([[True], [False], [False]])
+    fresh = env.reset(old.clone().set("_reset", mask))["latent"]
+    assert not fresh[0].any()
+    assert torch.equal(fresh[1:], old["latent"][1:])

@@ -8,10 +8,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, StepCounter, TransformedEnv
+from torchrl.envs import ActionScaling, EnvBase, StepCounter, TransformedEnv, check_env_specs
 
 from phihp_torchrl import get_task
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.tasks import Actuator
 from phihp_torchrl.worlds import EnvWorld, SimulatedWorld, TorchRLConfig, import_object
 
 PENDULUM = get_task("pendulum")
@@ -237,3 +238,28 @@ def test_a_module_that_fails_says_why(tmp_path, monkeypatch):
 def test_a_name_has_a_module_and_a_function(name):
     with pytest.raises(ConfigError, match=r"^make: expected module:function, got "):
         TorchRLConfig(name)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "cartpole", "acrobot-swingup"])
+def test_specs_of_worlds_without_limits_give_numbers(name):
+    """gymnasium says infinite limits, of which TorchRL samples NaN."""
+    for world in (SimulatedWorld(name), EnvWorld(get_task(name), SimulatedWorld(name).make_env)):
+        env = world.make_env()
+        for _ in range(5):
+            for spec in (env.observation_spec, env.full_action_spec, env.full_reward_spec):
+                values = spec.rand().values(True, True)
+                assert all(value.isfinite().all() for value in values)
+        check_env_specs(env)
+
+
+@pytest.mark.parametrize("extra", [{}, {"action_rate_limit": 3.0}, {"actuator": Actuator(2.0)}])
+def test_actions_stay_in_the_spec_of_a_scaled_world(extra):
+    task = replace(get_task("pendulum"), **extra)
+    world = SimulatedWorld(task)
+    for env in (world.make_env(), world.make_batch([3], seed=0)):
+        scaled = TransformedEnv(env, ActionScaling())
+        actions = scaled.rollout(30)["action"]
+        assert actions.abs().max() <= 1.0
+        assert actions.abs().max() > 0.5
+    with pytest.raises(ConfigError, match=r"expected bounds of torque within the world's, -1 to 1"):
+        EnvWorld(task, lambda: TransformedEnv(world.make_env(), ActionScaling())).make_env()

@@ -20,6 +20,7 @@ from phihp_torchrl.integrators import check_integrator, integrator_of
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds.base import World
 from phihp_torchrl.worlds.command_memory import command_memory
+from phihp_torchrl.worlds.open_limits import open_limits
 from phihp_torchrl.worlds.simulated.plant import Plant, PlantPhysics, find_plant
 
 
@@ -127,7 +128,9 @@ class SimulatedWorld(World):
             noise=self.config.noise,
             render_mode="rgb_array" if render else None,
         )
-        return TransformedEnv(GymWrapper(env), Compose(StepCounter(), *command_memory(self.task)))
+        wrapped = GymWrapper(env)
+        transforms = Compose(StepCounter(), *open_limits(wrapped), *command_memory(self.task))
+        return TransformedEnv(wrapped, transforms)
 
     def picture(self, env: EnvBase) -> NDArray[Any] | None:
         return env.base_env._env.render()
