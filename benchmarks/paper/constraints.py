@@ -48,6 +48,7 @@ def train(lines: Sequence[str], seed: int) -> Agent:
     config = read_run_config(load_config(TASK, overrides=list(lines)))
     task = task_of(config)
     dynamics = load_agent(AGENTS / TASK, planner=False).dynamics
+    assert dynamics is not None  # shipped agents have one
     torch.manual_seed(seed)
     trainer = PolicyTrainer(task, dynamics, config.section("policy"), seed=seed)
     while not trainer.done:

@@ -45,7 +45,7 @@ def returns(model: TaskWorldModel, policy: Policy, states: Tensor, steps: int) -
     return Rollouts(model, act, steps).returns([], states, steps).total
 
 
-def policies(task: Task, actor: Policy, untrained: int) -> dict[str, list[Policy]]:
+def policies(task: Task, actor: Any, untrained: int) -> dict[str, list[Any]]:
     """Policies by what they are."""
     center, scale = task.bounds.center, task.bounds.scale
     full = [

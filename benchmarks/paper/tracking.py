@@ -58,7 +58,7 @@ SETTINGS = {
 }
 """What differs from the defaults: a small budget, one way to learn, and no pictures."""
 
-SETTLED = {
+SETTLED: dict[str, Any] = {
     "warm_start": True,
     "keep_incumbent": True,
     "num_kept_elites": 2,
