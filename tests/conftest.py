@@ -46,7 +46,7 @@ def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
     """Every episode's figure is an empty one, which is written all the same."""
     show = sys.modules.get("phihp_torchrl.evaluation.show")
     if show is not None and "drawn" not in request.fixturenames:
-        monkeypatch.setattr(show, "episode_figure", lambda episode: Figure(figsize=(1, 1)))
+        monkeypatch.setattr(show, "episode_figure", lambda *_, **__: Figure(figsize=(1, 1)))
 
 
 @pytest.fixture
