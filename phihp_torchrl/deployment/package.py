@@ -92,7 +92,7 @@ def use_package(agent: Agent, path: Path) -> None:
 def describe(path: Path, identity: str) -> None:
     """Write what the package is for, as JSON beside it."""
     told = {"format": _FORMAT, "sha256": _digest(path), **_here(identity)}
-    _description(path).write_text(json.dumps(told, indent=2) + "\n")
+    _description(path).write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
 
 
 def check_package(path: Path, identity: str) -> None:

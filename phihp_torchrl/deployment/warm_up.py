@@ -85,7 +85,11 @@ class WarmUp:
         if process is not None and self._place is not None and agent is not None:
             try:
                 if process.returncode:
-                    text = Path(self._place.name, "log").read_text(errors="replace").strip()
+                    text = (
+                        Path(self._place.name, "log")
+                        .read_text(errors="replace", encoding="utf-8")
+                        .strip()
+                    )
                     raise AgentError((text.splitlines() or ["no reason given"])[-1])
                 use_package(agent, Path(self._place.name, "plan.pt2"))
                 self.compiled = True

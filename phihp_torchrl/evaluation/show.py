@@ -85,7 +85,7 @@ def show_episode(
 def _write_table(episode: Episode, predicted: Predictions | None, path: Path) -> None:
     """Write an episode as a table, a row for each state; numbers that there are not are empty."""
     system, task = episode.task.system, episode.task
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         foreseen = [f"predicted {name}" for name in system.state_names] if predicted else []
         table.writerow(["time", *system.state_names, *system.action_names, "reward", *foreseen])

@@ -73,7 +73,7 @@ def expect(config: RunConfig, path: Path) -> Expected:
     if earlier is not None:
         seconds = {name: earlier.get(name) for name in names}
         return Expected(seconds, seconds, seconds, "the last run of these settings beside it")
-    rates = json.loads(_RATES.read_text())
+    rates = json.loads(_RATES.read_text(encoding="utf-8"))
     of = rates["seconds"].get(f"{config.method}/{config.preset}/{config.task}", {})
     ends: list[dict[str, float | None]] = [{}, {}, {}]
     for name in names:

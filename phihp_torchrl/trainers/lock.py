@@ -106,7 +106,7 @@ class RunLock:
 def owner(directory: Path) -> dict[str, Any]:
     """Who works on a run, or was killed at it: ``pid``, ``host``, ``since``; empty for nobody."""
     try:
-        found = json.loads((directory / OWNER).read_text())
+        found = json.loads((directory / OWNER).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}

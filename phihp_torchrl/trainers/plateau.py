@@ -96,6 +96,7 @@ class Plateau:
         >>> model = TaskWorldModel(task, HybridDynamics.hybrid(task))
         >>> floor = Floor(model, task.reset.sample([2]), steps=5, seed=0)
         >>> plateau = Plateau(schedule, 0.2, 0.1, round_to=100, floor=lambda: floor)
+        >>> import torch
         >>> plateau.see(0, torch.zeros(2))
         >>> plateau.see(100, torch.tensor([10.0, 12.0]))
         >>> plateau.see(300, torch.tensor([10.0, 12.01]))

@@ -62,7 +62,7 @@ def write_report(directory: RunDirectory, truth: Mapping[str, float] | None = No
     rows = read_rows(directory.metrics)
     results: dict[str, Any] = {}
     if directory.evaluation.is_file():
-        results = json.loads(directory.evaluation.read_text())
+        results = json.loads(directory.evaluation.read_text(encoding="utf-8"))
     title = f"{config['task']}: {config.get('method', 'phihp')}, seed {config['seed']}"
     warned = cautions((text, "") for text in metadata.get("warnings", ()))
     parts = {

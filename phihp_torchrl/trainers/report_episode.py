@@ -31,7 +31,7 @@ def episode(path: Path) -> str:
     table = path / "episode.csv"
     if not table.is_file():
         return ""
-    with table.open(newline="") as file:
+    with table.open(newline="", encoding="utf-8") as file:
         columns = _columns(list(csv.reader(file)))
     time = columns.pop("time")
     predicted = {k: columns.pop(k) for k in [*columns] if k.startswith(_PREDICTED)}

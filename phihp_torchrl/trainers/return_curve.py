@@ -19,7 +19,7 @@ def read_rows(metrics: Path) -> list[dict[str, str]]:
     """The rows of a run's ``metrics.csv``; none if there is no such file."""
     if not metrics.is_file():
         return []
-    with metrics.open(newline="") as file:
+    with metrics.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 

@@ -94,7 +94,7 @@ class RunDirectory:
             ConfigError: if the file was damaged or edited, or was not written to its end.
         """
         try:
-            text = self.evaluation.read_text()
+            text = self.evaluation.read_text(encoding="utf-8")
         except FileNotFoundError:
             return None
         except (OSError, ValueError) as error:

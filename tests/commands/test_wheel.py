@@ -35,7 +35,7 @@ def test_every_file_of_the_package_is_in_it_and_no_other(wheel: Path) -> None:
         packed = {name for name in archive.namelist() if ".dist-info/" not in name}
     package = ROOT / "phihp_torchrl"
     ours = {str(path.relative_to(ROOT)) for path in package.rglob("*")
-            if path.suffix in (".py", ".yaml") or path.name == "py.typed"}  # fmt: skip
+            if path.suffix in (".py", ".yaml", ".json") or path.name == "py.typed"}  # fmt: skip
     assert packed == ours
     assert "phihp_torchrl/py.typed" in packed
     assert "phihp_torchrl/config/settings/task/acrobot.yaml" in packed

@@ -157,14 +157,12 @@ def test_fixed_step_schemes_are_one_graph(name, integrator, substeps):
     torch.testing.assert_close(compiled(state, action), step(state, action))
 
 
-def test_a_broken_state_spoils_its_own_row_or_is_refused():
+def test_a_broken_state_spoils_its_own_row_alone():
     state = torch.tensor([[math.nan, 0.0], [1.0, 0.0]])
-    for integrator in FIXED_STEP:
-        new = make_integrator(integrator)(oscillator, state, 0.1, FREE)
+    for integrator in (*(make_integrator(name) for name in FIXED_STEP), Dopri5()):
+        new = integrator(oscillator, state, 0.1, FREE)
         assert new[0].isnan().any()
         assert new[1].isfinite().all()
-    with pytest.raises(ValueError, match=r"^state: expected finite"):
-        Dopri5()(oscillator, state, 0.1, FREE)
 
 
 # Substeps

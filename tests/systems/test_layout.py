@@ -37,12 +37,12 @@ def test_stops_by_name():
     ("limits", "restitution", "message"),
     [
         ({"y": (0.0, 1.0)}, 0.0, "position_limits: unknown ['y'], expected some of ['x', 'theta']"),
-        ({"x": 1.0}, 0.0, "position_limits.x: expected (low, high)"),
+        ({"x": 1.0}, 0.0, "position_limits.x: expected a list, got 1.0"),
         ({"x": (1.0, 0.0)}, 0.0, "position_limits.x: expected (low, high) with low < high"),
         ({"theta": (-1.0, 4.0)}, 0.0, "position_limits.theta: expected both within [-pi, pi]"),
         ({"theta": (-inf, 1.0)}, 0.0, "position_limits.theta: expected both within [-pi, pi]"),
         ({"x": (0.0, 1.0)}, 1.5, "restitution: expected a number in [0, 1], got 1.5"),
-        ({"x": (0.0, 1.0)}, {"x": math.nan}, "restitution.x: expected a number in [0, 1]"),
+        ({"x": (0.0, 1.0)}, {"x": math.nan}, "restitution: expected a number, got {'x': nan}"),
         ({"x": (0.0, 1.0)}, {"theta": 0.5}, "restitution: unknown ['theta'], expected some of"),
     ],
 )

@@ -67,7 +67,11 @@ def test_the_bounds_are_minus_one_and_one_and_the_middle_is_zero(limits):
 def test_without_a_bound_actions_are_in_their_own_unit(limits):
     bounds = bounds_of(limits)
     is_open = ~(bounds.low.isfinite() & bounds.high.isfinite())
-    assert (bounds.center[is_open] == 0).all()
+    # Zero, or as near to it as leaves a unit of the action between it and the one bound.
+    low, high, center = (part[is_open] for part in (bounds.low, bounds.high, bounds.center))
+    assert (center >= low + 1).all()
+    assert (center <= high - 1).all()
+    assert ((center == 0) | (center == low + 1) | (center == high - 1)).all()
     assert (bounds.scale[is_open] == 1).all()
     assert all(part.isfinite().all() for part in (bounds.center, bounds.scale))
 
@@ -78,7 +82,7 @@ def test_without_a_bound_actions_are_in_their_own_unit(limits):
         ((-2.0,), (2.0,), [0.0], [2.0]),
         ((-6.0,), (12.0,), [3.0], [9.0]),
         ((0.0,), (100.0,), [50.0], [50.0]),
-        ((0.0, -inf), (inf, 1.0), [0.0, 0.0], [1.0, 1.0]),
+        ((0.0, -inf), (inf, 1.0), [1.0, 0.0], [1.0, 1.0]),
         ((-1.0, 0.0), (1.0, 4.0), [0.0, 2.0], [1.0, 2.0]),
         ((-3e38,), (3e38,), [0.0], [3e38]),
     ],

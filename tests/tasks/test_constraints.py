@@ -163,7 +163,7 @@ def test_a_constrained_step_compiles_as_one_graph():
         (lambda: Constraint("x", high=1.0, price=-1.0), "constraints.x.price"),
         (lambda: Constraint("x", high=1.0, hard=1), "constraints.x.hard"),
         (lambda: Constraint("x", high=1.0, price=1.0, function=3), "constraints.x.function"),
-        (lambda: limited("x"), "constraints"),
+        (lambda: limited("x"), "constraints[0]"),
         (lambda: replace(SWINGUP, constraints=NEAR), "constraints"),
         (lambda: limited(Constraint("y", high=1.0, price=1.0)), "constraints.y"),
         (lambda: limited(NEAR, WALL), "constraints.x"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import shutil
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -23,7 +25,7 @@ from phihp_torchrl.trainers import (
     PolicyConfig,
     RunConfig,
 )
-from phihp_torchrl.trainers.checkpoints import load_state
+from phihp_torchrl.trainers.checkpoints import load_state, save_state
 
 run_module = import_module("phihp_torchrl.trainers.run")  # the package has a function of this name
 
@@ -109,3 +111,18 @@ def assert_same_run(ours: Path, theirs: Path) -> None:
         assert_equal(*states, phase)
     weights = [(path / "agent" / "weights.safetensors").read_bytes() for path in (ours, theirs)]
     assert weights[0] == weights[1]
+
+
+def forget_settings(path: Path) -> None:
+    """Leave a run's folder as it was before anything in it had a record of the settings."""
+    place = path / "metadata.json"
+    metadata = json.loads(place.read_text())
+    for key in ("config", "code", "sha256"):
+        metadata.pop(key, None)
+    place.write_text(json.dumps(metadata))
+    for phase in (path / "phases").iterdir():
+        origin = {"task": CONFIG.task}
+        state = load_state(phase, metadata=origin)
+        del state["settings"]
+        shutil.rmtree(phase)
+        save_state(phase, state, metadata=origin)

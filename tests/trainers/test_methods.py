@@ -19,7 +19,7 @@ from phihp_torchrl.trainers import read_result, run
 from phihp_torchrl.trainers.checkpoints import load_state
 
 from .method_parts import TASKS, small
-from .run_parts import CONFIG, Crash, assert_equal, rows, run_module
+from .run_parts import CONFIG, Crash, assert_equal, forget_settings, rows, run_module
 
 PARTS = {
     "hybrid_planner": {"planner", "actor"},
@@ -139,6 +139,7 @@ def test_a_run_from_before_there_were_methods_is_phihps(
     content = OmegaConf.load(older / "config.yaml")
     content.pop("method")
     OmegaConf.save(content, older / "config.yaml")
+    forget_settings(older)
     assert run(replace(CONFIG, phases=("model",)), older, resume=True).finished
     later = replace(CONFIG, phases=("policy",), start_from=str(older))
     assert run(later, tmp_path / "later").finished

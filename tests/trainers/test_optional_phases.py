@@ -18,7 +18,7 @@ from phihp_torchrl.trainers import CalibrateConfig, read_run_config, run
 from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.trainers.run_request import read_request
 
-from .run_parts import CONFIG, rows, with_sections
+from .run_parts import CONFIG, forget_settings, rows, with_sections
 
 WITHOUT = ("model", "policy", "evaluate")
 ON = CalibrateConfig(
@@ -33,6 +33,7 @@ def age(path: Path) -> None:
     del settings["calibrate"]
     assert list(settings["phases"]) == list(WITHOUT)
     OmegaConf.save(settings, file)
+    forget_settings(path)
 
 
 # Settings
