@@ -147,6 +147,8 @@ def _world(config: PlayConfig, agent: Agent) -> World:
 
     trained_in = (agent.metadata.get("config") or {}).get("world")
     named = {} if config.world else named_code({"world": trained_in})
+    # A module that the user names is the user's wish; what it would be called with is not.
+    named = {key: name for key, name in named.items() if name not in config.plugins}
     if named and not config.trust:
         listed = ", ".join(f"{key}: {name}" for key, name in named.items())
         raise ConfigError(

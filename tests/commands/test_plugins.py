@@ -45,7 +45,7 @@ def test_one_run_with_all_of_them(
     phihp("train", "resume=run")
     with pytest.raises(SystemExit, match=r"rest\.naps: 4, not 3"):
         phihp("train", "resume=run", "rest.naps=4")
-    phihp("evaluate", "agent=run/agent", "plugins=[my_plugin.py]", "episodes=2", "video=false",
+    phihp("evaluate", "agent=run/agent", "plugins=[my_plugin.py]", "episodes=1", "video=false",
           "latency_actions=0")  # fmt: skip
     assert "my-pendulum in rig 7" in capsys.readouterr().out
     # The same world, and the same seeds: the same returns.

@@ -58,7 +58,9 @@ def test_a_module_of_the_working_directory(
     words = ("world=torchrl", "world.make=my_rig:make_env", "task=pendulum")
     phihp("train", *words, "run_dir=run", *FAST)
     assert "| pendulum in torchrl | 1 | 60 |" in capsys.readouterr().out
-    phihp("evaluate", "agent=run/agent", "baselines=none", *PLAY)
+    with pytest.raises(SystemExit, match=r"say trust=true"):
+        phihp("evaluate", "agent=run/agent", "baselines=none", *PLAY)
+    phihp("evaluate", "agent=run/agent", "baselines=none", "trust=true", *PLAY)
     assert "pendulum in torchrl my_rig:make_env" in capsys.readouterr().out
     assert returns(place / "run/agent/evaluation.json") == returns(place / "run/evaluation.json")
     # Its keyword arguments are options; that one is an environment of another task.

@@ -98,6 +98,7 @@ def test_actions_are_drawn_within_lopsided_bounds():
 # Both at once.
 
 
+@pytest.mark.usefixtures("drawn")
 def test_an_agent_is_shown(tmp_path):
     pytest.importorskip("pygame")
     agent = planner(SHORT)

@@ -57,7 +57,7 @@ def hang(number: int) -> None:
 @pytest.mark.parametrize(
     ("owner", "method", "call", "done"),
     [
-        pytest.param(ModelTrainer, "collect", 0, 0, id="before anything is saved"),
+        pytest.param(ModelTrainer, "_collect", 0, 0, id="before anything is saved"),
         pytest.param(ModelTrainer, "fit", 1, 1, id="in a fit, whose real steps are saved"),
         pytest.param(PolicyTrainer, "advance", 1, 3, id="in training, after it changed weights"),
         pytest.param(EvaluatePhase, "_evaluate", 1, 6, id="in an evaluation"),
@@ -92,7 +92,7 @@ def test_a_unit_is_given_up_and_done_again(
     monkeypatch.undo()
     torch.rand(7)
     if method == "fit":  # no real step is taken a second time
-        monkeypatch.setattr(ModelTrainer, "collect", None)
+        monkeypatch.setattr(ModelTrainer, "_collect", None)
     assert run(CONFIG, tmp_path / "run", resume=True).finished
     assert_same_run(tmp_path / "run", whole)
 
