@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
-from measures import Between, Difference, difference, holm, ratio_between
+from measures import FEWEST_SEEDS, Between, Difference, difference, holm, ratio_between
 from phihp_torchrl.evaluation import PUBLISHED
 from report.bounds import margin
 from report.efficiency import sample_efficiency
@@ -169,8 +169,14 @@ def _of_differences(found: dict[str, Difference], tasks: dict[str, str]) -> list
 def _of_ratio(
     what: str, ratio: Between, least: float, effect: str, seeds: tuple[int, int]
 ) -> Finding:
-    """Shown where the whole of it is at least ``least``, refuted where none of it is."""
+    """Shown where the whole of it is at least ``least``, refuted where none of it is.
+
+    What a ratio lies between says nothing of how it varies from seed to seed, so that fewer than
+    :data:`~measures.FEWEST_SEEDS` on either side show nothing.
+    """
     verdict = SHOWN if ratio.low >= least else REFUTED if ratio.high < least else NOT_SHOWN
+    if min(seeds) < FEWEST_SEEDS:
+        verdict = NOT_SHOWN
     above = "" if math.isinf(ratio.high) else f" to {ratio.high:.1f}"
     interval = f"{ratio.low:.1f}{above or ' and more'} times"
     return Finding(what, verdict, effect, interval, f"{seeds[0]}, {seeds[1]}")
