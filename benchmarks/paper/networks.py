@@ -40,12 +40,11 @@ def widths(actor: list[int], critic: list[int], *rates: float) -> list[str]:
 
 VARIANTS: dict[str, list[str]] = {
     "default": [],
-    "published": widths([300, 300], [200, 200, 200], 5e-4, 1e-3),
     "2x64": widths([64, 64], [64, 64], 1e-3, 2e-3),
     "3x64": widths([64, 64], [64, 64, 64], 1e-3, 2e-3),
     "2x96": widths([96, 96], [96, 96], 1e-3, 2e-3),
     "2x128": widths([128, 128], [128, 128], 1e-3, 2e-3),
-    "2x128-slow": widths([128, 128], [128, 128], 5e-4, 1e-3),
+    "2x128-slow": widths([128, 128], [128, 128]),
     "3x128": widths([128, 128], [128, 128, 128], 1e-3, 2e-3),
     "3x128-slow": widths([128, 128], [128, 128, 128], 5e-4, 1e-3),
     "2x64-128": widths([64, 64], [128, 128], 1e-3, 2e-3),
@@ -53,18 +52,11 @@ VARIANTS: dict[str, list[str]] = {
 
 
 def train(
-    task: str,
-    settings: list[str],
-    seed: int,
-    path: Path,
-    label: str,
-    compile: bool,
-    commit: str | None,
-    keep: Path | None,
+    task: str, variant: str, seed: int, path: Path, label: str, compile: bool, commit: str | None
 ) -> None:
     """One policy phase in the model of the task's agent."""
     agent = load_agent(AGENTS / task)
-    config = read_run_config(load_config(task, overrides=settings)).section("policy")
+    config = read_run_config(load_config(task, overrides=VARIANTS[variant])).section("policy")
     torch.manual_seed(seed)
     assert agent.dynamics is not None  # of an agent that was trained in it
     trainer = PolicyTrainer(agent.task, agent.dynamics, config, seed=seed, compile=compile)
@@ -87,7 +79,7 @@ def train(
         record = {
             "task": task,
             "variant": label,
-            "settings": settings,
+            "settings": VARIANTS[variant],
             "seed": seed,
             "done": trainer.done,
             "curve": curve,
@@ -97,10 +89,6 @@ def train(
         partial.write_text(json.dumps(record) + "\n")
         os.replace(partial, path)
     print(f"{path.stem}: {curve[-1]}", flush=True)
-    if keep is not None:
-        keep.mkdir(parents=True, exist_ok=True)
-        end = {"task": task, "seed": seed, "settings": settings, "state": trainer.state_dict()}
-        torch.save(end, keep / f"{path.stem}.end")
 
 
 def write_tables(results: Path) -> None:
@@ -163,11 +151,9 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[20])
-    parser.add_argument("--set", nargs="+", default=[], help="further settings, for all variants")
     parser.add_argument("--label", default="", help="added to the variant's name in the results")
     parser.add_argument("--eager", action="store_true", help="without compiling")
     parser.add_argument("--commit", help="of the code, where it is run outside its repository")
-    parser.add_argument("--keep", type=Path, help="directory for the ends of training")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--only-write", action="store_true")
     options = parser.parse_args()
@@ -181,10 +167,7 @@ def main() -> None:
                     label = variant + options.label
                     path = options.results / f"{task}-{label}-seed{seed}.json"
                     if not (path.is_file() and json.loads(path.read_text())["done"]):
-                        settings = [*VARIANTS[variant], *options.set]
-                        compiled, commit = not options.eager, options.commit
-                        keep = options.keep
-                        train(task, settings, seed, path, label, compiled, commit, keep)
+                        train(task, variant, seed, path, label, not options.eager, options.commit)
     write_tables(options.results)
 
 

@@ -44,9 +44,8 @@ class TD3Config:
     """Hyper-parameters of TD3 (paper, section 4.2; ``preset=paper`` has the published values).
 
     Args:
-        actor_hidden_sizes: widths of the actor's hidden layers (paper: 2 x 300).
-        critic_hidden_sizes: widths of each critic's hidden layers (paper: 3 x 200). Two layers are
-            faster and suffice for most tasks; a double pendulum that swings up needs three.
+        actor_hidden_sizes: widths of the actor's hidden layers.
+        critic_hidden_sizes: widths of each critic's hidden layers.
         actor_learning_rate: learning rate of the actor.
         critic_learning_rate: learning rate of the critics.
         last_layer_scale: factor on the initial weights of the actor's last layer.
@@ -70,10 +69,10 @@ class TD3Config:
 such as '5 s', got 1.5.
     """
 
-    actor_hidden_sizes: tuple[int, ...] = (128, 128)
-    critic_hidden_sizes: tuple[int, ...] = (128, 128, 128)
-    actor_learning_rate: float = 1e-3
-    critic_learning_rate: float = 2e-3
+    actor_hidden_sizes: tuple[int, ...] = (300, 300)
+    critic_hidden_sizes: tuple[int, ...] = (200, 200, 200)
+    actor_learning_rate: float = 3e-4
+    critic_learning_rate: float = 1e-3
     last_layer_scale: float = 0.1
     gamma: Discount = 0.99
     tau: float = 0.02

@@ -50,11 +50,6 @@ class RealTD3Config(TD3Config):
         evaluation_interval: real steps between two evaluations.
         evaluation_episodes: episodes in an evaluation. They are not counted as real steps and do
             not affect the training.
-        actor_hidden_sizes: widths of the actor's hidden layers, the published ones, for narrower
-            ones were compared in imagination alone.
-        critic_hidden_sizes: widths of each critic's hidden layers, the published ones.
-        actor_learning_rate: learning rate of the actor.
-        critic_learning_rate: learning rate of the critics.
         tau: step τ of the target networks towards the networks, in each update of the actor.
         value_expansion: number of rewards in the value target; 1, because there is no model.
 
@@ -66,10 +61,6 @@ class RealTD3Config(TD3Config):
         4
     """
 
-    actor_hidden_sizes: tuple[int, ...] = (300, 300)
-    critic_hidden_sizes: tuple[int, ...] = (200, 200, 200)
-    actor_learning_rate: float = 3e-4
-    critic_learning_rate: float = 1e-3
     tau: float = 0.01
     real_steps: int = 100_000
     batch_size: int = 128
