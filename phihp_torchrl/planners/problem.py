@@ -108,7 +108,9 @@ def score_sequences(
     if problem.judge is not None:
         scores = problem.judge(state, actions)
         return torch.nan_to_num(scores, *(float("-inf"),) * 3), actions
-    guide = _Guide(problem, policy_noise, completed, len(actions)) if actor is not None else None
+    guide = None
+    if actor is not None and (policy_noise is not None or completed):
+        guide = _Guide(problem, policy_noise, completed, len(actions))
     roll_out = _at_once if hasattr(model, "judge") else _step_by_step
     rolled = roll_out(state, actions, problem, guide, gamma, change_cost, last)
     state, actions, total, over, lost = rolled
@@ -122,7 +124,7 @@ def score_sequences(
             tail = problem.value(observation, actor(observation)).to(total.dtype)
         valued = torch.add(total, tail, alpha=alpha * discount)
         total = valued if over is None else torch.where(over, total, valued)
-    if guide is not None and guide.acts:
+    if guide is not None:
         lost = lost | ~actions.isfinite().all(-1).all(0)
     total = total.masked_fill(lost, float("-inf"))
     return torch.nan_to_num(total, *(float("-inf"),) * 3), actions
@@ -135,7 +137,6 @@ class _Guide:
         self, problem: Problem, noise: Tensor | None, completed: int, horizon: int
     ) -> None:
         self.problem, self.noise, self.completed, self.last = problem, noise, completed, horizon - 1
-        self.acts = noise is not None or completed > 0
 
     def __call__(self, k: int, state: Any, action: Tensor) -> Tensor:
         noise = None if self.noise is None else self.noise[k]
@@ -165,9 +166,8 @@ def _step_by_step(
     """
     taken = []
     discount, previous = 1.0, last
-    guided = guide is not None and guide.acts
     for k, action in enumerate(actions.unbind(0)):
-        if guide is not None and guided:
+        if guide is not None:
             action = guide(k, state, action)
             taken.append(action)
         state, reward, terminated = problem.model.transition(state, action)
@@ -199,10 +199,9 @@ def _at_once(
     """The same, with rewards and ends of all steps together, for a model that judges apart."""
     model: Any = problem.model
     states, commands, taken = [state], [], []
-    guided = guide is not None and guide.acts
-    known = None if guided else model.commands(actions)
+    known = model.commands(actions) if guide is None else None
     for k, action in enumerate(actions.unbind(0)):
-        if guide is not None and guided:
+        if guide is not None:
             action = guide(k, state, action)
             taken.append(action)
         command, state = model.advance(state, action, None if known is None else known[k])
