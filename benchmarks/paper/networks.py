@@ -52,7 +52,7 @@ VARIANTS: dict[str, list[str]] = {
 
 
 def train(
-    task: str, variant: str, seed: int, path: Path, label: str, compile: bool, commit: str | None
+    task: str, variant: str, seed: int, path: Path, compile: bool, commit: str | None
 ) -> None:
     """One policy phase in the model of the task's agent."""
     agent = load_agent(AGENTS / task)
@@ -78,7 +78,7 @@ def train(
         )
         record = {
             "task": task,
-            "variant": label,
+            "variant": variant,
             "settings": VARIANTS[variant],
             "seed": seed,
             "done": trainer.done,
@@ -151,7 +151,6 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[20])
-    parser.add_argument("--label", default="", help="added to the variant's name in the results")
     parser.add_argument("--eager", action="store_true", help="without compiling")
     parser.add_argument("--commit", help="of the code, where it is run outside its repository")
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -164,10 +163,9 @@ def main() -> None:
         for seed in options.seeds:
             for task in options.tasks:
                 for variant in options.variants:
-                    label = variant + options.label
-                    path = options.results / f"{task}-{label}-seed{seed}.json"
+                    path = options.results / f"{task}-{variant}-seed{seed}.json"
                     if not (path.is_file() and json.loads(path.read_text())["done"]):
-                        train(task, variant, seed, path, label, not options.eager, options.commit)
+                        train(task, variant, seed, path, not options.eager, options.commit)
     write_tables(options.results)
 
 
