@@ -109,12 +109,17 @@ def learn(
     settings["world"] = _world_settings(reality)
     if run_dir is None:
         run_dir = settings.get("run_dir")
-    result = run(read_run_config(settings), run_dir, world=reality)
+    config = read_run_config(settings)
+    if "evaluate" not in config.phases_to_do:
+        raise ConfigError(
+            "phases",
+            f"expected 'evaluate' among them, which saves the agent, got "
+            f"{list(config.phases_to_do)}. `phihp train` runs phases without it.",
+        )
+    result = run(config, run_dir, world=reality)
     if not result.finished:
         raise RuntimeError(f"stopped by a signal; go on with: {resume_command(result.path)}")
     directory = RunDirectory(result.path)
-    if not directory.agent.is_dir():
-        raise ConfigError("phases", "expected 'evaluate' among them, which saves the agent.")
     return Learned(load_agent(directory.agent, task=reality.task), result.path)
 
 

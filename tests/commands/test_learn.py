@@ -175,6 +175,7 @@ def test_plugins_may_be_among_the_words(place: Path) -> None:
 def test_a_run_that_saves_no_agent_says_so() -> None:
     with pytest.raises(ConfigError, match=r"^phases: .*'evaluate'"):
         learn("pendulum", overrides=[*FAST, "phases=[model]"], run_dir="run")
+    assert not Path("run").exists()  # it says so before the first real step
 
 
 def test_it_is_where_users_look_for_it() -> None:
