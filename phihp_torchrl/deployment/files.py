@@ -9,8 +9,6 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, fields, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +18,8 @@ from torch import Tensor, nn
 
 from phihp_torchrl.config import (
     DIGEST,
-    ConfigError,
-    Registry,
     check_seal,
     digest_of,
-    from_mapping,
     sealed,
 )
 from phihp_torchrl.deployment.agent import Agent
@@ -33,9 +28,9 @@ from phihp_torchrl.deployment.formats import (
     BOUNDS_OF_VERSION_1,
     FORMAT,
     FORMAT_VERSION,
-    TaskSignature,
     upgrade,
 )
+from phihp_torchrl.deployment.kinds import find_kind
 from phihp_torchrl.deployment.package import (
     PACKAGE_FILE,
     check_package,
@@ -45,8 +40,9 @@ from phihp_torchrl.deployment.package import (
     write_package,
 )
 from phihp_torchrl.deployment.reading import MAX_JSON_BYTES, AgentError, read_json, read_weights
+from phihp_torchrl.deployment.saved_task import describe_task, find_task, read_signature
 from phihp_torchrl.origin import package_version
-from phihp_torchrl.tasks import Actuator, Constraint, Task, get_task
+from phihp_torchrl.tasks import Task
 
 _log = logging.getLogger(__name__)
 AGENT_FILE = "agent.json"
@@ -55,27 +51,6 @@ NEXT_WEIGHTS_FILE = ".next-weights.safetensors"
 """Weights of a saving that was cut off after ``agent.json`` was replaced, or before."""
 
 _SAVING = ".saving-"
-
-AGENT_KINDS: Registry[type[Agent]] = Registry("kind")
-"""Registered classes of agents, by the ``kind`` in their files."""
-
-AGENT_KINDS.register(Agent.kind, Agent)
-
-# Of ours that come with a folder of their own, where it is: a file may name a kind, never a module.
-_HOMES = {"td-mpc": "phihp_torchrl.tdmpc"}
-
-
-def register_agent(agent: type[Agent], *, replace: bool = False) -> type[Agent]:
-    """Register a class of agents, so that files of its ``kind`` can be loaded; returns the class.
-
-    Raises:
-        ConfigError: if the kind is taken and ``replace`` is false.
-
-    Examples:
-        >>> register_agent(Agent, replace=True).kind
-        'phihp'
-    """
-    return AGENT_KINDS.register(agent.kind, agent, replace=replace)
 
 
 def save_agent(
@@ -135,9 +110,7 @@ def save_agent(
         "format_version": FORMAT_VERSION,
         "package_version": package_version(),
         "kind": agent.kind,
-        "task": asdict(TaskSignature.of(agent.task)),
-        **_additions(agent.task),
-        **({"outside": outside} if (outside := _outside(agent.task)) else {}),
+        **describe_task(agent.task),
         **config,
         "weights_sha256": digest_of(data),
         "metadata": dict(agent.metadata if metadata is None else metadata),
@@ -224,19 +197,13 @@ def load_agent(
     _check_format(path, content)
     try:
         content = upgrade(content)
-        kind = _find_kind(content.get("kind"))
-        signature = _read_signature(content["task"])
+        kind = find_kind(content.get("kind"))
+        signature = read_signature(content["task"])
     except KeyError as error:
         raise AgentError(f"{path}: expected the key {error}, found none.") from error
     except (ValueError, TypeError, AttributeError) as error:
         raise AgentError(f"{path}: {error}") from error
-    task = _resolve_task(path, signature, task)
-    task = _with_additions(path, task, content)
-    if (saved := content.get("outside", {})) != (ours := _outside(task)):
-        raise AgentError(
-            f"{path}: task {task.name!r} is another one here: expected the reference, inputs and "
-            f"disturbance {saved}, got {ours}."
-        )
+    task = find_task(path, signature, task, content)
     weights = _read_weights(directory / WEIGHTS_FILE, kind, task, content)
     try:
         check_seal(sealed_content)  # last, for other errors say more
@@ -281,22 +248,6 @@ def _take_package(agent: Agent, path: Path, identity: str, device: torch.device)
         _log.warning("The agent plans eagerly: %s", error)
 
 
-def _find_kind(kind: Any) -> type[Agent]:
-    if isinstance(kind, str) and kind in _HOMES and kind not in AGENT_KINDS:
-        import_module(_HOMES[kind])
-    return AGENT_KINDS.find(kind)
-
-
-def _read_signature(mapping: Mapping[str, Any]) -> TaskSignature:
-    names = {field.name for field in fields(TaskSignature)}
-    if set(mapping) != names:
-        raise ConfigError("task", f"expected the keys {sorted(names)}, got {sorted(mapping)}.")
-    values: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in mapping.items()
-    }
-    return TaskSignature(**values)
-
-
 def _plans(content: Mapping[str, Any]) -> bool:
     return content["metadata"].get("acting") != "actor"
 
@@ -315,88 +266,6 @@ def _check_format(path: Path, content: dict[str, Any]) -> None:
         raise AgentError(
             f"{path}: metadata: expected a JSON object, got {content.get('metadata')!r}."
         )
-
-
-def _resolve_task(path: Path, saved: TaskSignature, wanted: str | Task | None) -> Task:
-    if not isinstance(saved.name, str):
-        raise AgentError(f"{path}: task.name: expected a text, got {saved.name!r}.")
-    name = wanted.name if isinstance(wanted, Task) else wanted
-    if name is not None and name != saved.name:
-        raise AgentError(
-            f"{path}: expected an agent for task {name!r}, got one for {saved.name!r}."
-        )
-    try:
-        task = wanted if isinstance(wanted, Task) else get_task(saved.name)
-    except ValueError as error:
-        raise AgentError(f"{path}: {error} Register it first, or pass it as task.") from error
-    for field in fields(TaskSignature):
-        here, there = (getattr(s, field.name) for s in (TaskSignature.of(task), saved))
-        if here != there:
-            raise AgentError(
-                f"{path}: task {saved.name!r} is another one here: expected its {field.name} "
-                f"{here!r}, got {there!r}."
-            )
-    return task
-
-
-def _outside(task: Task) -> dict[str, Any]:
-    """The reference, inputs and disturbance that an agent depends on, as plain values."""
-    disturbance = task.disturbance
-    return {
-        **task.outside.config,
-        **({} if disturbance is None else {"disturbance": disturbance.config}),
-    }
-
-
-_RATES = ("action_rate_limit", "action_rate_cost")
-
-
-def _additions(task: Task) -> dict[str, Any]:
-    """What a task adds to the state of its system, as plain values; nothing where it adds none."""
-    rates = {name: value for name in _RATES if (value := getattr(task, name)) is not None}
-    limits = [constraint.config for constraint in task.constraints]
-    actuator = {} if task.actuator is None else {"actuator": task.actuator.config}
-    return actuator | rates | ({"constraints": limits} if limits else {})
-
-
-def _with_additions(path: Path, task: Task, content: Mapping[str, Any]) -> Task:
-    """The task with the actuator, the rates and the constraints the agent was trained for."""
-    numbers = content.get("actuator")
-    try:
-        actuator = None if numbers is None else from_mapping(Actuator, numbers, "actuator")
-        rates = {name: content.get(name) for name in _RATES}
-        constraints = _constraints(task, content.get("constraints", []))
-        changed = replace(task, actuator=actuator, constraints=constraints, **rates)  # type: ignore[arg-type]
-    except (ConfigError, TypeError, AttributeError) as error:
-        raise AgentError(f"{path}: {error}") from error
-    for name in ("actuator", *_RATES):
-        here, saved = getattr(task, name), getattr(changed, name)
-        if here not in (None, saved):
-            raise AgentError(
-                f"{path}: task {task.name!r} is another one here: expected its {name} {here}, "
-                f"got {saved}."
-            )
-    return task if changed == task else changed
-
-
-def _constraints(task: Task, saved: list[dict[str, Any]]) -> tuple[Constraint, ...]:
-    """The constraints of an agent's file: those of the task, or made anew where it has none."""
-    ours = [constraint.config for constraint in task.constraints]
-    if saved == ours:
-        return task.constraints
-    if ours:
-        raise ConfigError(
-            "constraints",
-            f"task {task.name!r} is another one here: expected its constraints {ours}, "
-            f"got {saved}.",
-        )
-    if functions := [entry["name"] for entry in saved if entry.get("function")]:
-        raise ConfigError(
-            "constraints",
-            f"the agent was trained with {functions}, functions that are no part of its file: "
-            "expected them in the task; pass it as task.",
-        )
-    return tuple(Constraint(**entry) for entry in saved)
 
 
 def _read_weights(

@@ -13,7 +13,7 @@ import torch
 from phihp_torchrl import Agent, evaluate, get_task, load_agent, save_agent
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.deployment import AgentError, PlanModule, register_agent
-from phihp_torchrl.deployment.files import AGENT_KINDS
+from phihp_torchrl.deployment.kinds import AGENT_KINDS
 from phihp_torchrl.planners import MPPIConfig
 from phihp_torchrl.tdmpc import TOLD, TDMPCAgent, TOLDConfig
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
