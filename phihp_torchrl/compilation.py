@@ -8,11 +8,13 @@ reduced precision only, so the compiler is told here to use it for float32 as we
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor, fx
+from torch._C._dynamo.eval_frame import reset_code
 from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_files
 from torch._inductor.virtualized import V
 
@@ -49,7 +51,8 @@ def compile_graph(
     Shapes are static: each combination of shapes has a separate graph, which is compiled at the
     first call with these shapes. That takes 10 to 40 s, or 1 to 3 s from the compiler's cache on
     disk. The number of graphs is limited for each compiled function and not for all of them
-    together, so any number of agents may compile the same function in a process.
+    together, so any number of agents may compile the same function in a process. Graphs are
+    released with the function that is returned, and the memory of a dropped agent with them.
 
     Each call compares the arguments and the training modes of modules with those that the graph
     was compiled for. It does not compare everything else that the function closes over, because
@@ -77,6 +80,8 @@ def compile_graph(
 
     # Dynamo counts graphs per code object, which all closures made here would otherwise share.
     graph.__code__ = graph.__code__.replace()
+    # Its table from compiled to original code keeps both, with the graphs and kernels, for good.
+    weakref.finalize(graph, reset_code, graph.__code__).atexit = False
     if "mode" not in options:  # the compiler takes a mode or options
         ours: dict[str, Any] = {"guard_filter_fn": _guards_to_keep}
         if options.get("backend", "inductor") == "inductor":

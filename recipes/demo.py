@@ -12,6 +12,7 @@ import shutil
 import sys
 from pathlib import Path
 
+from phihp_torchrl.commands import use_utf8
 from phihp_torchrl.display import loading
 
 TASK = "pendulum-swingup"
@@ -36,7 +37,7 @@ def learn(words: list[str]) -> None:
     from torchrl.checkpoint import CheckpointError
 
     from phihp_torchrl.commands import tell
-    from phihp_torchrl.config import ConfigError, compose_yaml
+    from phihp_torchrl.config import ConfigError, compose_yaml, file_error
     from phihp_torchrl.trainers import read_request, run
 
     try:
@@ -44,6 +45,8 @@ def learn(words: list[str]) -> None:
         result = run(request.config, request.path, resume=request.resume)
     except (ConfigError, CheckpointError) as error:
         sys.exit(f"error: {error}")
+    except OSError as error:  # a full disk, a folder without permission, ...
+        sys.exit(f"error: {file_error(error)}")
     OUTPUT.mkdir(parents=True, exist_ok=True)
     tell(result)
     for name in ("report.html", "episode.png", "episode.gif"):
@@ -53,4 +56,5 @@ def learn(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
+    use_utf8()
     main(sys.argv[1:])

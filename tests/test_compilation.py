@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import pytest
 import torch
 from torch._inductor.utils import run_and_get_code
@@ -67,6 +70,23 @@ def test_every_function_has_its_own_graphs():
         for size in range(2, 2 + 2 * torch._dynamo.config.recompile_limit):
             compiled = compile_graph(scale, backend="eager")
             assert compiled(torch.ones(size)).tolist() == [2.0] * size
+
+
+def test_graphs_are_released_with_their_function():
+    kept = []
+
+    def backend(graph, _):
+        kept.append(weakref.ref(graph))
+        return graph.forward
+
+    for _ in range(2):
+        layer = torch.nn.Linear(2, 2)
+        compiled = compile_graph(layer.forward, backend=backend)
+        compiled(torch.ones(1, 2))
+        kept += [weakref.ref(layer), weakref.ref(compiled)]
+        del layer, compiled
+    gc.collect()
+    assert [part() for part in kept] == [None] * 6
 
 
 def test_a_graph_fits_its_arguments_and_the_modes_of_modules():

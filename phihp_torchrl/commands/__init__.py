@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from phihp_torchrl.commands.console import main
+from phihp_torchrl.commands.letters import use_utf8
 
 if TYPE_CHECKING:
     from phihp_torchrl.commands.job import tell

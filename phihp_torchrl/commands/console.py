@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
+from phihp_torchrl.commands.letters import use_utf8
 from phihp_torchrl.display import loading
 
 COMMANDS = {
@@ -37,6 +38,8 @@ def main(words: Sequence[str] | None = None, *, command: str | None = None, **op
         usage: phihp COMMAND [setting=value ...] [--help]
         ...
     """
+    if words is None:
+        use_utf8()
     words = list(sys.argv[1:] if words is None else words)
     if command is None:
         if not words or words[0] in ("-h", "--help"):

@@ -13,11 +13,11 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from torchrl.checkpoint import CheckpointError
 
-from phihp_torchrl.commands.words import file_error
 from phihp_torchrl.config import (
     MODULE,
     ConfigError,
     compose_yaml,
+    file_error,
     open_mappings,
     publish_offers,
 )

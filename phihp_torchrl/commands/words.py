@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from phihp_torchrl.config import (
     ConfigError,
+    file_error,
     from_mapping,
     override_key,
     parse_overrides,
@@ -55,19 +56,6 @@ def read_lines(words: Sequence[str]) -> dict[str, Override]:
         plugins: Any = lines["plugins"].value()
         import_plugins([plugins] if isinstance(plugins, str) else list(plugins or ()))
     return lines
-
-
-def file_error(error: OSError) -> str:
-    """An error of the system in words: which file, and why.
-
-    Examples:
-        >>> file_error(OSError(28, "No space left on device", "runs/one/metrics.csv"))
-        'runs/one/metrics.csv: No space left on device'
-        >>> file_error(OSError(27, "File too large"))
-        'a file cannot be written or read: File too large'
-    """
-    place = error.filename or "a file cannot be written or read"
-    return f"{place}: {error.strerror or error}"
 
 
 def help_of(cls: type, usage: str) -> str:

@@ -56,6 +56,7 @@ from phihp_torchrl.config.seals import (
     sealed,
     unsealed,
 )
+from phihp_torchrl.config.system_errors import file_error, names_file
 from phihp_torchrl.config.typed import (
     default_of,
     differences,

@@ -8,12 +8,14 @@ Hydra composes the files. Nothing here imports torch, so that ``--help`` answers
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -86,11 +88,23 @@ def compose_yaml(overrides: Sequence[str], config_dir: str | Path | None = None)
     try:
         with (
             published_offers(*places),
+            _apart(),
             initialize_config_module(MODULE, version_base="1.3"),
         ):
             return compose("train", lines)
     except (HydraException, OmegaConfBaseException) as error:
         raise _explain(overrides, config_dir, error) from error
+
+
+@contextmanager
+def _apart() -> Iterator[None]:
+    """A context in which Hydra may be set up anew, as in a job that it has composed."""
+    outer = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().hydra = outer
 
 
 def _explain(
@@ -168,21 +182,32 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
         ConfigError: for a word that cannot be parsed.
     """
     try:
-        lines = OverridesParser.create().parse_overrides(list(overrides))
+        lines = OverridesParser.create().parse_overrides([*map(_with_any_letters, overrides)])
     except HydraException as error:
         raise ConfigError("settings", " ".join(str(error).split())) from error
     return [line for line in lines if not line.is_delete()]
 
 
 def open_mappings(words: Sequence[str]) -> list[str]:
-    """Prefix overrides that add keys to a mapping with ``++``, as Hydra wants them.
+    """Prefix overrides that add keys to a mapping with ``++``, and quote what Hydra cannot read.
 
     Examples:
         >>> open_mappings(["world.friction={joint:0.1}", "actuator.lag=0.1", "seed=0"])
         ['++world.friction={joint:0.1}', '++actuator.lag=0.1', 'seed=0']
+        >>> open_mappings(["run_dir=größe"])
+        ["run_dir='größe'"]
     """
     adds = re.compile(rf"[\w.]+=\s*\{{|({'|'.join(_MAPPINGS)})\.[\w.]+=")
+    words = [_with_any_letters(word) for word in words]
     return [f"++{word}" if adds.match(word) else word for word in words]
+
+
+def _with_any_letters(word: str) -> str:
+    """Quote a plain value with letters that Hydra's grammar takes in quotes alone."""
+    key, _, value = word.partition("=")
+    if value.isascii() or any(sign in value for sign in "'\"[]{}(),\\$"):
+        return word
+    return f"{key}='{value}'"
 
 
 def override_key(line: Override) -> str:

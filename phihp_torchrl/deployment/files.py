@@ -20,6 +20,7 @@ from phihp_torchrl.config import (
     DIGEST,
     check_seal,
     digest_of,
+    names_file,
     sealed,
 )
 from phihp_torchrl.deployment.agent import Agent
@@ -128,7 +129,7 @@ def save_agent(
         shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=directory, prefix=_SAVING) as temporary:
         for name, payload in ((WEIGHTS_FILE, data), (AGENT_FILE, text.encode())):
-            with open(Path(temporary, name), "wb") as file:
+            with names_file(directory / name), open(Path(temporary, name), "wb") as file:
                 file.write(payload)
                 file.flush()
                 os.fsync(file.fileno())

@@ -6,6 +6,7 @@ import csv
 import logging
 from pathlib import Path
 
+from phihp_torchrl.config import names_file
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.evaluation.episode import Episode, play_episode
 from phihp_torchrl.evaluation.figures import Curve, episode_figure
@@ -77,7 +78,8 @@ def show_episode(
     predicted = None
     if agent.dynamics is not None:
         predicted = predict_episode(agent.dynamics, episode)
-    episode_figure(episode, predicted, curve).savefig(files[0], dpi=120)
+    with names_file(files[0]):
+        episode_figure(episode, predicted, curve).savefig(files[0], dpi=120)
     _write_table(episode, predicted, directory / f"{name}.csv")
     return files
 
@@ -85,7 +87,7 @@ def show_episode(
 def _write_table(episode: Episode, predicted: Predictions | None, path: Path) -> None:
     """Write an episode as a table, a row for each state; numbers that there are not are empty."""
     system, task = episode.task.system, episode.task
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with names_file(path), path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         foreseen = [f"predicted {name}" for name in system.state_names] if predicted else []
         table.writerow(["time", *system.state_names, *system.action_names, "reward", *foreseen])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from phihp_torchrl.config import names_file
 from phihp_torchrl.evaluation.episode import Episode
 
 _COLORS = 32
@@ -72,8 +73,9 @@ def write_gif(
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.part")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    with names_file(path):
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
     return path
 
 

@@ -16,7 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointAdapter, CheckpointError, CheckpointRotation
 
-from phihp_torchrl.config import DIGEST, digest_of
+from phihp_torchrl.config import DIGEST, digest_of, names_file
 
 _log = logging.getLogger(__name__)
 
@@ -44,8 +44,10 @@ class SafeStateAdapter(CheckpointAdapter):
         self, component: Any, path: Path, *, args: tuple[Any, ...], kwargs: Mapping[str, Any]
     ) -> Any:
         path.mkdir(parents=True, exist_ok=True)
-        (path / "tensors.safetensors").write_bytes(component.data)
-        (path / "tree.json").write_text(component.tree, encoding="utf-8")
+        with names_file(path / "tensors.safetensors"):
+            (path / "tensors.safetensors").write_bytes(component.data)
+        with names_file(path / "tree.json"):
+            (path / "tree.json").write_text(component.tree, encoding="utf-8")
 
     def load(
         self,

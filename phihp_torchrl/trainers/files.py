@@ -7,7 +7,7 @@ import stat
 import uuid
 from pathlib import Path
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, names_file
 
 STAGE = ".stage"
 """Ending of files that are being written."""
@@ -18,11 +18,12 @@ def write_atomically(path: Path, text: str) -> None:
     # A name that nobody can know, and a file that must be new: no link is written through.
     stage = path.with_name(f".{path.name}.{uuid.uuid4().hex}{STAGE}")
     try:
-        with stage.open("x", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(stage, path)
+        with names_file(path):
+            with stage.open("x", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(stage, path)
     finally:
         stage.unlink(missing_ok=True)
 

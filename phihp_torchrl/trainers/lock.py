@@ -58,7 +58,11 @@ class RunLock:
             raise ConfigError(str(self.directory), f"cannot be written to: {error}") from error
         except (OSError, NotImplementedError) as error:
             self._without_lock(error)
-        self._replace(owner(self.directory))
+        try:
+            self._replace(owner(self.directory))
+        except OSError:  # a full disk
+            self._lock.release()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:

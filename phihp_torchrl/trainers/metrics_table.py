@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from phihp_torchrl.config import names_file
 from phihp_torchrl.trainers.files import write_atomically
 
 _log = logging.getLogger(__name__)
@@ -52,7 +53,7 @@ class MetricsTable:
             self._columns += names
             self._write()
             return
-        with self.path.open("a", newline="", encoding="utf-8") as file:
+        with names_file(self.path), self.path.open("a", newline="", encoding="utf-8") as file:
             self._writer(file).writerow(new)
 
     def _write(self) -> None:

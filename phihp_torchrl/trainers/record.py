@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, names_file
 from phihp_torchrl.trainers.collect import CollectConfig, random_policy, steady, within_rate
 from phihp_torchrl.trainers.exploration import Exploration
 from phihp_torchrl.worlds import World, crossings_text, guard_env
@@ -57,7 +57,8 @@ def record(world: World, config: CollectConfig, steps: int, seed: int, path: Pat
     env = guard_env(world.make_env(), task, config.exploration.guards, crossings)
     env.set_seed(seed)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with torch.no_grad(), path.open("w", newline="", encoding="utf-8") as file:
+    writing = path.open("w", newline="", encoding="utf-8")
+    with torch.no_grad(), names_file(path), writing as file:
         table = csv.writer(file)
         table.writerow(["time", "episode", *task.system.state_names, *task.system.action_names])
 

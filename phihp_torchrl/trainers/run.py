@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import random
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 import torch
 from torchrl.checkpoint import CheckpointError, GlobalRNGState
 
-from phihp_torchrl.config import ConfigError, resolve_seconds
+from phihp_torchrl.config import ConfigError, names_file, resolve_seconds
 from phihp_torchrl.deployment import plain_defaults
 from phihp_torchrl.display import Progress
 from phihp_torchrl.origin import describe_origin
@@ -30,6 +31,7 @@ from phihp_torchrl.trainers.keeper import Keeper
 from phihp_torchrl.trainers.lock import RunLock
 from phihp_torchrl.trainers.loggers import REAL_STEPS, RunLogger, make_logger
 from phihp_torchrl.trainers.metrics_table import MetricsTable
+from phihp_torchrl.trainers.next_steps import resume_command
 from phihp_torchrl.trainers.phases import PHASES, Phase, real_steps
 from phihp_torchrl.trainers.rehearsal import rehearse
 from phihp_torchrl.trainers.report import report_run
@@ -130,7 +132,7 @@ def run(
     else:
         rehearse(config, world)
         config, directory = new_directory(config, path)
-    with RunLock(directory.path):
+    with _told(directory), RunLock(directory.path):
         if not resume:
             begin(config, directory)
         expected = expect(config, directory.path)
@@ -141,6 +143,19 @@ def run(
         if result.finished:
             report_run(directory, world)
     return result
+
+
+@contextmanager
+def _told(directory: RunDirectory) -> Iterator[None]:
+    """Errors of files name at least the run, and say how it goes on."""
+    try:
+        with names_file(directory.path):
+            yield
+    except OSError as error:
+        if directory.config.is_file():
+            go_on = resume_command(directory.path)
+            error.add_note(f"What was saved before is whole; go on with: {go_on}")
+        raise
 
 
 class _Run:

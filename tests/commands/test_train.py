@@ -41,6 +41,7 @@ def test_flags_may_stand_between_settings(phihp: Command, place: Path) -> None:
     phihp("train", *MODEL, "--config-dir", "mine", "run_dir=run", "seed=3")
     kept = yaml.safe_load((place / "run" / "config.yaml").read_text())
     assert kept["seed"] == 3
+    assert (place / "run" / "report.html").is_file()  # it composes the defaults, in Hydra's job
 
 
 def test_a_stopped_run_says_how_to_go_on(
@@ -68,7 +69,9 @@ def test_an_error_of_the_system_is_one_line_with_a_path(
         raise OSError(28, "No space left on device", "my run/metrics.csv")
 
     monkeypatch.setattr(job, "run", full)
-    with pytest.raises(SystemExit, match=r"^error: my run/metrics.csv: No space left on device$"):
+    with pytest.raises(
+        SystemExit, match=r"^error: my run/metrics.csv: No space left on device\. Make room"
+    ):
         phihp("train", *MODEL)
 
 
