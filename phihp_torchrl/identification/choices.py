@@ -8,15 +8,22 @@ from dataclasses import replace
 import torch
 
 from phihp_torchrl.identification.config import AUTO, IdentifyConfig
-from phihp_torchrl.identification.each_action import delay_each, in_words, with_delays
-from phihp_torchrl.identification.model import Model, part_of
+from phihp_torchrl.identification.each_action import (
+    delay_each,
+    in_words,
+    is_fraction,
+    lag_each,
+    with_delays,
+)
+from phihp_torchrl.identification.model import NEUTRAL, Model, part_of
 from phihp_torchrl.identification.parts import ActuatorTrial
+from phihp_torchrl.identification.second_look import choose_again, near
 from phihp_torchrl.identification.trials import Trial, Trials
 from phihp_torchrl.integrators import make_integrator
 from phihp_torchrl.tasks import Actuator, Numbers
 
-_WHOLE = 0.1
-"""A delay this near to a whole number of steps is taken to be one."""
+_ALIKE = 5.0
+"""Ratio of the sizes of actions up to which they may be of one unit."""
 
 
 def given_path(config: IdentifyConfig) -> Actuator:
@@ -49,24 +56,54 @@ class Chooser:
     def choose_all(self) -> None:
         """Delay, lag, the other parts, and the integrator, in this order.
 
-        Where several actions move, each may have its own delay.
+        Where several actions move, each may have its own delay and lag. Unequal gains or a dead
+        zone hide what is under way, so delay and lag are chosen anew behind such parts.
         """
+        self.choose_path()
+        self.choose_slew()
+        before = self.best.model.fitted
+        self.choose_parts()
+        if self.best.model.fitted != before:
+            choose_again(self)
+        self.choose_integrator()
+
+    def choose_path(self) -> None:
+        """Delay and lag, of all actions together and then of each."""
         self.choose_delay()
-        moving = self._moving()
+        moving = self.moving()
         if len(moving) > 1 and self.config.delay == AUTO:
             delay_each(self, moving)
         self.choose_lag()
-        self.choose_slew()
-        self.choose_parts()
-        self.choose_integrator()
+        if len(moving) > 1 and self.config.lag == AUTO:
+            lag_each(self, moving)
 
-    def consider(self, part: str, model: Model) -> Trial:
-        """Try a model that starts from the constants of the best one."""
+    def consider(self, part: str, model: Model, like: Trial | None = None) -> Trial:
+        """Try a model that starts from the constants of another trial, by default the best one."""
+        like = like or self.best
         raw = model.first()
-        raw[: model.constants] = self.best.raw[: model.constants]
-        trial = self.trials.attempt(part, model, raw, self.best)
+        raw[: model.constants] = like.raw[: model.constants]
+        trial = self.trials.attempt(part, model, raw, like)
         self.tried.append(trial)
         return trial
+
+    def consider_fraction(self, part: str, model: Model) -> None:
+        """Try a model whose delay was added to what is fitted, and keep it if it is better.
+
+        Near a whole number of steps, that number is fitted instead.
+        """
+        trial = self.consider(part, model)
+        if not self.trials.better(trial, self.best):
+            return
+        *others, own = model.fitted
+        found = model.number(model.actuator(trial.raw), own)
+        if not is_fraction(found):
+            path = trial.model.put(model.actuator(trial.raw), own, float(round(found)))
+            whole = replace(model, fitted=tuple(others), path=path)
+            label = f"delay {in_words(path.delay_steps)}"
+            trial = self.consider(", ".join([label, *others]), whole, trial)
+            if not self.lower(trial):
+                return
+        self.best = trial
 
     def choose_delay(self) -> None:
         """Whole delays first, and then a fraction if that is clearly better."""
@@ -77,15 +114,12 @@ class Chooser:
             trial = self.consider(f"delay {delay}", model)
             if self.trials.better(trial, self.best):
                 self.best = trial
-            elif delay > self._longest() + 1:
+            elif delay > self.longest() + 1:
                 break
-        start = abs(self._longest() - 0.5)
-        trial = self.consider(
+        start = abs(self.longest() - 0.5)
+        self.consider_fraction(
             "delay with a fraction", self.best.model.with_part("delay_steps", start)
         )
-        found = trial.raw[-1].item()
-        if abs(found - round(found)) > _WHOLE and self.trials.better(trial, self.best):
-            self.best = trial
 
     def choose_lag(self) -> None:
         """A lag, with the delay that was found and with shorter ones, which it may explain."""
@@ -102,11 +136,13 @@ class Chooser:
             instead = self.best is base and not late and _longest(delay) > 0  # one for another
             if self.lower(trial) if instead else self.trials.better(trial, self.best):
                 self.best = trial
+        if self.best is not base and self.config.delay == AUTO:
+            near(self)
 
     def choose_slew(self) -> None:
         """A limit of the rate, behind the delay, or instead of a lag that stands for it."""
         rate = self._rate()
-        if self.config.slew != AUTO or not rate:
+        if self.config.slew != AUTO or not rate or not self._alike():
             return
         lagging = any(part_of(name)[0] == "lag" for name in self.best.model.fitted)
         for share in (0.3, 0.05):
@@ -116,18 +152,28 @@ class Chooser:
                 self.best, lagging = trial, False
 
     def choose_parts(self) -> None:
-        """Unequal gains and a dead zone."""
-        action = self.trials.samples.action
-        size = float(action.abs().max())
-        first = {"gain_low": 0.9, "dead_zone": 0.05 * size}
-        for part, start in first.items():
-            possible = start > 0 and (part != "gain_low" or bool((action < 0).any()))
-            if getattr(self.config, part) != AUTO or not possible or not self._moves():
-                continue
-            model = self.settled().with_part(part, start)
-            trial = self.consider(f"{self.best.part}, {part}", model)
-            if self.trials.better(trial, self.best):
-                self.best = trial
+        """Unequal gains and a dead zone, of each action where several move."""
+        action, moving = self.trials.samples.action, self.moving()
+        each = list(moving) if len(moving) > 1 else [None] * len(moving)
+        for part in ("gain_low", "dead_zone"):
+            for i in each if getattr(self.config, part) == AUTO else ():
+                column = action if i is None else action[:, i]
+                if part == "gain_low" and not bool((column < 0).any()):
+                    continue
+                start = 0.9 if part == "gain_low" else 0.05 * float(column.abs().max())
+                model = self.settled().with_part(part, start, i)
+                trial = self.consider(f"{self.best.part}, {model.fitted[-1]}", model)
+                if self.trials.better(trial, self.best):
+                    self.best = trial
+
+    def drop(self, name: str) -> None:
+        """Leave out a fitted part that is not clearly needed."""
+        model = self.settled()
+        path = model.put(model.path, name, NEUTRAL[part_of(name)[0]])
+        fitted = tuple(n for n in model.fitted if n != name)
+        trial = self.consider(f"without {name}", replace(model, fitted=fitted, path=path))
+        if not self.trials.better(self.best, trial):
+            self.best = trial
 
     def choose_integrator(self) -> None:
         """Runge-Kutta with as few substeps as do; a step of Euler's where the data were made so."""
@@ -173,7 +219,8 @@ class Chooser:
         """The delay of the best model, for all actions or for each."""
         return self.best.model.actuator(self.best.raw).delay_steps
 
-    def _longest(self) -> float:
+    def longest(self) -> float:
+        """The longest delay of the best model."""
         return _longest(self.delay())
 
     def lower(self, trial: Trial) -> bool:
@@ -182,11 +229,16 @@ class Chooser:
 
     def _moves(self) -> bool:
         """Whether any command ever changes."""
-        return bool(self._moving())
+        return bool(self.moving())
 
-    def _moving(self) -> list[int]:
+    def moving(self) -> list[int]:
         """The actions whose commands change."""
         return (self.trials.samples.action.std(0) > 0).nonzero().flatten().tolist()
+
+    def _alike(self) -> bool:
+        """Whether the actions that move are about as large, so that one rate may limit them all."""
+        sizes = self.trials.samples.action[:, self.moving()].std(0)
+        return bool(sizes.max() <= _ALIKE * sizes.min())
 
     def _rate(self) -> float:
         samples = self.trials.samples

@@ -17,7 +17,9 @@ from phihp_torchrl.identification.errors import judge_predictions
 from phihp_torchrl.identification.experiments import Experiments
 from phihp_torchrl.identification.fitting import Fitted, fit_recordings
 from phihp_torchrl.identification.logs import of_recordings
+from phihp_torchrl.identification.parts import Finding
 from phihp_torchrl.identification.result import Identification
+from phihp_torchrl.identification.spikes import without_spikes
 from phihp_torchrl.identification.stops import noise_level
 from phihp_torchrl.identification.verdicts import (
     judge_actuator,
@@ -79,9 +81,10 @@ def identify(
     samples = gather(task.system, recordings)
     if not samples.state.isfinite().any():
         raise ConfigError("recordings", "expected measured states, got NaN alone.")
+    samples, spikes = without_spikes(task.system, samples)
     with torch.no_grad():
         fitted = fit_recordings(task, samples, config)
-        return _report(task, samples, recordings, config, fitted, begun)
+        return _report(task, samples, recordings, config, fitted, begun, spikes)
 
 
 def _report(
@@ -91,6 +94,7 @@ def _report(
     config: IdentifyConfig,
     fitted: Fitted,
     begun: float,
+    spikes: list[Finding],
 ) -> Identification:
     system, model, fit, division = task.system, fitted.model, fitted.fit, fitted.division
     doubt = uncertainty(fit, scale_of(model, fit.raw))
@@ -109,6 +113,7 @@ def _report(
     warnings = [
         *diagnostics.of_constants(constants),
         *of_recordings(system, samples),
+        *spikes,
         *more,
         *diagnostics.of_fit(division.stopped, division.stops, fitted),
         *beyond,

@@ -67,8 +67,8 @@ class ActuatorEstimate:
         delay_steps: dead time in steps of the data (their median), for all actions or for each.
         lag_s: time constant in seconds, for all actions or for each.
         slew: largest rate in units of the action per second; ``None`` for no limit.
-        dead_zone: size of commands that have no effect.
-        gain_low: gain of negative commands.
+        dead_zone: size of commands that have no effect, for all actions or for each.
+        gain_low: gain of negative commands, likewise.
         intervals: 95 % intervals of the fitted parts, by name, such as ``"lag_s"``, or
             ``"lag_s of volts"`` for one action.
         tried: every path that was tried, in order.
@@ -78,8 +78,8 @@ class ActuatorEstimate:
     delay_steps: Numbers = 0.0
     lag_s: Numbers = 0.0
     slew: float | None = None
-    dead_zone: float = 0.0
-    gain_low: float = 1.0
+    dead_zone: Numbers = 0.0
+    gain_low: Numbers = 1.0
     intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     tried: tuple[ActuatorTrial, ...] = ()
     actions: tuple[str, ...] = ()

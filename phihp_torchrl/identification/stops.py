@@ -24,6 +24,8 @@ _VISITS = 3
 """Visits to a stop; twice as many that all turn at the same place make one suspect by itself."""
 _NARROW = 0.03
 """Share of the range that the same place is narrower than."""
+_JUMP = 4.0
+"""How much larger than usual a change of the speed is at which something was hit."""
 
 
 def noise_level(samples: Samples) -> Tensor:
@@ -67,8 +69,8 @@ def suspect_stops(system: System, samples: Samples) -> Stops:
     """Where samples pile up at the end of a position's range, as they do at a stop.
 
     A motion that turns by itself spends time there too, but no more than a few times that beside
-    it, and seldom turns at the same place again. Whether the equations fail there, only a fit can
-    tell.
+    it, and seldom turns at the same place again. What bounces off a stop leaves few samples there,
+    but its speed jumps. Whether the equations fail there, only a fit can tell.
     """
     found: Stops = {}
     level = noise_level(samples)
@@ -97,9 +99,29 @@ def _pile(column: Tensor, samples: Samples, level: float) -> float | None:
     visits = int((at_top.diff().to(torch.int) != 0).sum()) // 2
     piled = count >= _PILE * float(beside)
     returns = visits >= 2 * _VISITS and band < _NARROW * float(top - known.min())
-    if count < _LEAST or visits < _VISITS or not (piled or returns):
+    stays = count >= _LEAST and visits >= _VISITS and (piled or returns)
+    if not stays and _bounces(column, samples, level) < _VISITS:
         return None
     return float(column[at_top].median())
+
+
+def _bounces(column: Tensor, samples: Samples, level: float) -> int:
+    """How often the speed jumps downwards within a sample of the upper end of a column."""
+    same = samples.stretch[2:] == samples.stretch[:-2]
+    bend = torch.where(same, column.diff(n=2), 0.0).nan_to_num()
+    moved = column.diff().abs()
+    moved = moved[moved.isfinite()]
+    if len(moved) < _LEAST:
+        return 0
+    top = float(column[column.isfinite()].max())
+    reach = float(torch.quantile(moved[:100_000], 0.99))
+    near = (column[1:-1] > top - reach).nan_to_num()
+    usual = bend[~near].abs()
+    if not len(usual):
+        return 0
+    large = max(_JUMP * float(torch.quantile(usual[:100_000], 0.99)), 8.0 * level)
+    jumps = near & (bend < -large)
+    return int((jumps.diff().to(torch.int) == 1).sum())
 
 
 def at_stops(system: System, samples: Samples, stops: Stops) -> Tensor:
