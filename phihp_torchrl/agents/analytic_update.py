@@ -19,6 +19,7 @@ from phihp_torchrl.agents.analytic import (
 )
 from phihp_torchrl.agents.analytic_config import AnalyticConfig
 from phihp_torchrl.agents.equations import adam_, adam_rates, critic_loss, soft_update_
+from phihp_torchrl.agents.gradients import grad_and_value
 from phihp_torchrl.agents.update import ActorCriticUpdate, Networks
 from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.dynamics import TaskWorldModel
@@ -230,14 +231,12 @@ class AnalyticUpdate(ActorCriticUpdate):
         config = self.config
         observation = self.world_model.observe(state)
         moves, norm = limited(
-            torch.func.grad(followed)(nets.actor, observation, noise, gradient, bounds, entropy),
+            grad_and_value(followed, nets.actor, observation, noise, gradient, bounds, entropy)[0],
             config.norm_limit,
         )
         rows = (part[order].chunk(config.critic_updates) for part in (observation, action, target))
         for i, (seen, done, value) in enumerate(zip(*rows, strict=True)):
-            slopes, loss = torch.func.grad_and_value(critic_loss)(
-                nets.critics, seen, done, value, bounds
-            )
+            slopes, loss = grad_and_value(critic_loss, nets.critics, seen, done, value, bounds)
             rates = (rate[i] for rate in critic_rates)
             adam_(nets.critics, slopes, nets.critic_means, nets.critic_squares, *rates)
         adam_(

@@ -17,6 +17,7 @@ from phihp_torchrl.agents.equations import (
     critic_loss,
     q_values,
 )
+from phihp_torchrl.agents.gradients import grad_and_value
 from phihp_torchrl.compilation import compile_graph
 from phihp_torchrl.config import (
     Steps,
@@ -246,7 +247,5 @@ def _step(
     root: Tensor,
 ) -> None:
     """Take one step of Adam on the critics, in place."""
-    gradients, _ = torch.func.grad_and_value(critic_loss)(
-        critics, observation, action, target, bounds
-    )
+    gradients, _ = grad_and_value(critic_loss, critics, observation, action, target, bounds)
     adam_(critics, gradients, means, squares, size, root)

@@ -17,6 +17,7 @@ from phihp_torchrl.agents.equations import (
     soft_update_,
     td3_target,
 )
+from phihp_torchrl.agents.gradients import grad_and_value
 from phihp_torchrl.agents.networks import make_actor, make_qvalue
 from phihp_torchrl.agents.update import ActorCriticUpdate, Networks
 from phihp_torchrl.compilation import compile_graph
@@ -240,13 +241,13 @@ class TD3Update(ActorCriticUpdate):
         parts = (part.chunk(config.policy_delay) for part in (batch.state, batch.action, target))
         for i, (state, action, value) in enumerate(zip(*parts, strict=True)):
             observation = observe(state)
-            gradients, loss_qvalue = torch.func.grad_and_value(critic_loss)(
-                nets.critics, observation, action, value, bounds
+            gradients, loss_qvalue = grad_and_value(
+                critic_loss, nets.critics, observation, action, value, bounds
             )
             rates = (rate[i] for rate in critic_rates)
             adam_(nets.critics, gradients, nets.critic_means, nets.critic_squares, *rates)
-        gradients, loss_actor = torch.func.grad_and_value(actor_loss)(
-            nets.actor, nets.critics, observation, bounds
+        gradients, loss_actor = grad_and_value(
+            actor_loss, nets.actor, nets.critics, observation, bounds
         )
         adam_(nets.actor, gradients, nets.actor_means, nets.actor_squares, *actor_rates)
         soft_update_(nets.target_actor, nets.actor, config.tau)
