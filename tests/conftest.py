@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import sys
+from collections.abc import Iterator
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -36,17 +38,31 @@ def seed() -> int:
     return SEED
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _undrawn() -> Iterator[None]:
+    """Every episode's figure is an empty one, which is written all the same.
+
+    Half of the time of a small run would go there. For the whole session, so that runs which many
+    tests share are made so too, and no test that undoes its own patches undoes this one.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        for module in _drawing():
+            patch.setattr(module, "episode_figure", lambda *_, **__: Figure(figsize=(1, 1)))
+        yield
+
+
 @pytest.fixture
-def drawn() -> None:
-    """Request it to have figures drawn; half of the time of a small evaluation goes there."""
+def drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Request it to have figures drawn."""
+    for module in _drawing():
+        drawing = sys.modules["phihp_torchrl.evaluation.figures"].episode_figure
+        monkeypatch.setattr(module, "episode_figure", drawing)
 
 
-@pytest.fixture(autouse=True)
-def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every episode's figure is an empty one, which is written all the same."""
-    show = sys.modules.get("phihp_torchrl.evaluation.show")
-    if show is not None and "drawn" not in request.fixturenames:
-        monkeypatch.setattr(show, "episode_figure", lambda *_, **__: Figure(figsize=(1, 1)))
+def _drawing() -> list[ModuleType]:
+    """The modules that draw, as far as they are loaded."""
+    names = ("phihp_torchrl.evaluation.show", "phihp_torchrl.trainers.rehearsal")
+    return [sys.modules[name] for name in names if name in sys.modules]
 
 
 @pytest.fixture
@@ -55,12 +71,22 @@ def aot_eager(monkeypatch: pytest.MonkeyPatch) -> None:
 
     Graphs are traced whole and differentiated, and then run by torch.
     """
+    _compile_by("aot_eager", monkeypatch)
+
+
+@pytest.fixture
+def traced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compile as always, but only as far as graphs: traced whole, and then run by torch."""
+    _compile_by("eager", monkeypatch)
+
+
+def _compile_by(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     compile = torch.compile
 
-    def traced(function: Any, *, fullgraph: bool, dynamic: bool | None, **_: Any) -> Any:
-        return compile(function, fullgraph=fullgraph, dynamic=dynamic, backend="aot_eager")
+    def compiled(function: Any, *, fullgraph: bool, dynamic: bool | None, **_: Any) -> Any:
+        return compile(function, fullgraph=fullgraph, dynamic=dynamic, backend=backend)
 
-    monkeypatch.setattr(torch, "compile", traced)
+    monkeypatch.setattr(torch, "compile", compiled)
     torch._dynamo.reset()
 
 

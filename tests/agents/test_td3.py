@@ -171,9 +171,9 @@ def test_generator_alone_is_drawn_from():
     assert torch.equal(before, torch.get_rng_state())
 
 
-@pytest.mark.parametrize("expansion", [1, 3])
-def test_a_step_is_one_graph(expansion):
-    update = make_update(replace(SMALL, value_expansion=expansion, target_noise=0.0))
+def test_a_step_is_one_graph():
+    """With a value expansion; without one it is compiled to machine code below."""
+    update = make_update(replace(SMALL, value_expansion=2, target_noise=0.0))
     compiled = copy.deepcopy(update)
     compiled._compiled_step = torch.compile(compiled._step, fullgraph=True, backend="eager")
     for _ in range(2):

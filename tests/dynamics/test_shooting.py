@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,11 +11,20 @@ from tensordict import TensorDict
 from phihp_torchrl import DynamicsLoss, HybridDynamics, get_task
 from phihp_torchrl.dynamics import FitConfig, fit
 from phihp_torchrl.dynamics.shooting import Windows, _Shooting, cut_windows
-from phihp_torchrl.trainers import ModelConfig, ModelTrainer
+from phihp_torchrl.trainers import CollectConfig, ModelConfig, ModelTrainer
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 TASK = get_task("pendulum")
 NOISE = {"theta": 0.01, "theta_dot": 0.05}
+MODEL = ModelConfig(
+    real_steps=300,
+    steps_per_iteration=300,
+    integrator="semi_implicit_euler",
+    fit=FitConfig(steps=10),
+    collect=CollectConfig(
+        planning_horizon=10, replan_every=5, num_candidates=16, top_k=4, optim_steps=1
+    ),
+)
 
 
 def episodes(count: int = 6, steps: int = 25, noise: float = 0.0) -> TensorDict:
@@ -103,8 +114,7 @@ def test_noise_in_one_step_errors_is_told(caplog):
     for noise, told in ((NOISE, True), ({}, False)):
         caplog.clear()
         world = SimulatedWorld(TASK, SimulatedConfig(noise=noise))
-        config = ModelConfig(real_steps=300, steps_per_iteration=300, fit=FitConfig(steps=10))
-        ModelTrainer(TASK, config, seed=0, world=world).advance()
+        ModelTrainer(TASK, MODEL, seed=0, world=world).advance()
         assert ("model.fit.method=multiple_shooting" in caplog.text) == told
 
 
@@ -112,7 +122,7 @@ def test_noise_in_one_step_errors_is_told(caplog):
 def test_a_run_with_noisy_sensors_predicts_to_the_noise():
     world = SimulatedWorld(TASK, SimulatedConfig(noise=NOISE))
     fitting = FitConfig(method="multiple_shooting")
-    config = ModelConfig(real_steps=1000, steps_per_iteration=1000, fit=fitting)
+    config = replace(MODEL, real_steps=1000, steps_per_iteration=1000, fit=fitting)
     torch.manual_seed(0)
     trainer = ModelTrainer(TASK, config, seed=0, world=world)
     trainer.advance()

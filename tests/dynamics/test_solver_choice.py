@@ -10,7 +10,7 @@ from phihp_torchrl import DynamicsLoss, HybridDynamics, get_task
 from phihp_torchrl.dynamics import FitConfig, FitReport, fit, fit_solver
 from phihp_torchrl.dynamics.solver_choice import SolverTrial, choose
 from phihp_torchrl.integrators import RK4, SemiImplicitEuler
-from phihp_torchrl.trainers import ModelConfig, ModelTrainer
+from phihp_torchrl.trainers import CollectConfig, ModelConfig, ModelTrainer
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 TASK = get_task("pendulum")
@@ -38,7 +38,7 @@ def test_the_solver_of_the_world_is_found(truth):
 
 
 def test_the_result_is_that_of_a_fit_with_the_chosen_solver():
-    known, config = data(RK4()), FitConfig(steps=20, batch_size=40)
+    known, config = data(RK4()), FitConfig(steps=8, batch_size=40)
     results = []
     for chooses in (True, False):
         torch.manual_seed(0)
@@ -69,7 +69,16 @@ def test_a_finer_solver_must_halve_the_error(errors, index):
 
 def test_a_run_chooses_and_remembers():
     world = SimulatedWorld(TASK, SimulatedConfig(integrator="rk4"))
-    config = ModelConfig(real_steps=100, steps_per_iteration=100, fit=FitConfig(steps=25))
+    collect = CollectConfig(
+        planning_horizon=5, replan_every=5, num_candidates=8, top_k=2, optim_steps=1
+    )
+    config = ModelConfig(
+        real_steps=100,
+        steps_per_iteration=100,
+        hidden_sizes=(4,),
+        fit=FitConfig(steps=25),
+        collect=collect,
+    )
     trainer = ModelTrainer(TASK, config, seed=3, world=world)
     trainer.advance()
     assert trainer.dynamics.integrator.name == "rk4"

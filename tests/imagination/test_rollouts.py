@@ -303,21 +303,21 @@ def test_a_chunk_is_one_graph():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["acrobot-swingup"])
-def test_compiled_by_inductor_equals_eager(name):
-    model, actor, bounds = make(name)
+def test_compiled_by_inductor_equals_eager(monkeypatch):
+    monkeypatch.setattr(Rollouts, "_RETURN_STEPS", 2)  # machine code for more takes a minute
+    model, actor, bounds = make()
     eager, compiled = (Rollouts(model, act, 3, compile=c) for c in (False, True))
     worlds = start(model)
     with torch.no_grad(), torch._dynamo.config.patch(error_on_recompile=True):
         for _ in range(2):
             noise = draw_noise(
-                model.task.reset.sample([STEPS, WORLDS]), bounds, std=0.1, random_fraction=0.2
+                model.task.reset.sample([2, WORLDS]), bounds, std=0.1, random_fraction=0.2
             )
             expected = eager.chunk(actor, worlds, noise)
             torch.testing.assert_close(compiled.chunk(actor, worlds, noise), expected)
             worlds = expected[1]
-            # 12 steps: two compiled chunks and a rest.
-            returns = (x.returns(actor, worlds.state, 12).total for x in (compiled, eager))
+            # 5 steps: two compiled chunks and a rest.
+            returns = (x.returns(actor, worlds.state, 5).total for x in (compiled, eager))
             torch.testing.assert_close(*returns, rtol=1e-4, atol=1e-4)
             actor[0].mul_(0.9)
 

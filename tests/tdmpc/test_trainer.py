@@ -77,7 +77,9 @@ def test_updates_per_step_keeps_fractions():
 
 
 def test_episodes_end_where_the_task_ends_them():
-    trainer = make_trainer("cartpole", max_steps=500, real_steps=150, seed_steps=100)
+    trainer = make_trainer(
+        "cartpole", max_steps=500, real_steps=150, seed_steps=100, updates_per_step=0.1
+    )
     finish(trainer)
     rows = trainer.replay.buffer.storage[:]
     ends = rows["next", "terminated"][:, 0]

@@ -5,11 +5,13 @@ from __future__ import annotations
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from phihp_torchrl import ConfigError
 from phihp_torchrl.config import parse_overrides
@@ -56,6 +58,20 @@ def test_it_passes_for_every_kind_of_method_and_draws_no_number(method: str) -> 
     before = torch.get_rng_state()
     rehearse(config, WORLD)
     assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.usefixtures("drawn")
+def test_the_figure_that_is_tried_is_the_one_of_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    saved: list[Figure] = []
+    save = Figure.savefig
+
+    def savefig(self: Figure, *arguments: Any, **options: Any) -> None:
+        save(self, *arguments, **options)
+        saved.append(self)
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    rehearse(CONFIG, WORLD)
+    assert [bool(figure.axes) for figure in saved] == [True]
 
 
 def test_a_planner_that_needs_too_much_memory_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

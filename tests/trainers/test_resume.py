@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from phihp_torchrl.trainers import run
 from phihp_torchrl.trainers.checkpoints import load_state, save_state
 from phihp_torchrl.trainers.interrupt import Interrupt
 
+from .forked import Forks
 from .run_parts import CONFIG, UNITS, Crash, assert_same_run, rows, run_module
 
 KILLS = {
@@ -28,51 +27,35 @@ KILLS = {
 """The unit at which a run is killed, and the method of a run after which."""
 
 KILLED = """
-import os, signal, sys
-sys.path.insert(0, {tests!r})
+import os, signal
 from phihp_torchrl.trainers import run
 from trainers.run_parts import CONFIG, run_module
 
-for number, (unit, name) in enumerate({kills!r}):
-    if child := os.fork():  # what is imported is imported once
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
-        continue
-    method = getattr(run_module._Run, name)
+method = getattr(run_module._Run, {name!r})
 
-    def killed(self, *arguments):
-        method(self, *arguments)
-        if self.position.unit == unit:
-            os.kill(os.getpid(), signal.SIGKILL)
+def killed(self, *arguments):
+    method(self, *arguments)
+    if self.position.unit == {unit}:
+        os.kill(os.getpid(), signal.SIGKILL)
 
-    setattr(run_module._Run, name, killed)
-    run(CONFIG, f"{place}/{{number}}")
-    os._exit(1)
+setattr(run_module._Run, {name!r}, killed)
+run(CONFIG, {path!r})
 """
 
 
-@pytest.fixture(scope="module")
-def killed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Runs in processes of their own, each killed somewhere."""
-    place = tmp_path_factory.mktemp("killed")
-    tests = str(Path(__file__).parents[1])
-    script = KILLED.format(tests=tests, kills=list(KILLS.values()), place=place)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return {name: place / str(number) for number, name in enumerate(KILLS)}
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("where", KILLS)
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(
-    whole: Path, killed: dict[str, Path], where: str
+    whole: Path, tmp_path: Path, forks: Forks, where: str
 ) -> None:
-    path = killed[where]
+    path, (unit, name) = tmp_path / "run", KILLS[where]
+    forks.start(KILLED.format(unit=unit, name=name, path=str(path)))
+    assert forks.wait() == -signal.SIGKILL
     torch.rand(7)  # the process that resumes has a past of its own
     assert run(CONFIG, path, resume=True).finished
     assert_same_run(path, whole)
 
 
-@pytest.mark.parametrize("unit", [0, 1, 3, UNITS - 1])
+@pytest.mark.parametrize("unit", [0, 3, UNITS - 1])
 def test_a_crash_loses_nothing(
     whole: Path, tmp_path: Path, unit: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -91,10 +74,10 @@ def test_a_crash_loses_nothing(
     assert_same_run(tmp_path / "run", whole)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_a_run_after_the_unit_and_its_checkpoint(
-    whole: Path, tmp_path: Path, number: int, monkeypatch: pytest.MonkeyPatch
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    number = signal.SIGTERM
     log_unit = run_module._Run._log_unit
 
     def interrupt(self: Any, *arguments: Any) -> None:

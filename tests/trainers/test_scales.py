@@ -130,8 +130,8 @@ def test_it_learns_in_any_units():
     def learn(unit, reward, scales):
         widths = {"actor_hidden_sizes": (32, 32), "critic_hidden_sizes": (32, 32)}
         config = PolicyConfig(
-            updates=600,
-            evaluation_interval=600,
+            updates=400,
+            evaluation_interval=400,
             real_evaluation_episodes=0,
             scales=scales,
             td3=TD3Config(**widths),

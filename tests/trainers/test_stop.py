@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,12 +19,12 @@ from phihp_torchrl.trainers.evaluate import EvaluatePhase
 from phihp_torchrl.trainers.interrupt import Abandoned, Interrupt
 from phihp_torchrl.trainers.keeper import Keeper
 
+from .forked import Forks
 from .run_parts import CONFIG, assert_same_run, rows, run_module
 
 RARELY = replace(CONFIG, checkpoint_interval=1000.0)
 LONG = """
-import os, sys, time
-sys.path.insert(0, {tests!r})
+import time
 from dataclasses import replace
 from phihp_torchrl.commands import tell
 from phihp_torchrl.trainers import PolicyTrainer, run
@@ -163,16 +161,15 @@ def test_nothing_in_memory_is_saved_over_something_later(tmp_path: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_process_ends_within_ten_seconds(whole: Path, tmp_path: Path, number: int) -> None:
+def test_a_process_ends_within_ten_seconds(
+    whole: Path, tmp_path: Path, forks: Forks, number: int
+) -> None:
     path = tmp_path / "run"
-    tests = str(Path(__file__).parents[1])
-    script = LONG.format(tests=tests, path=str(path))
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "now\n"
+    process = forks.start(LONG.format(path=str(path)))
+    assert forks.line() == "now"
     start = time.monotonic()
-    process.send_signal(number)
-    assert process.wait(timeout=60) == 128 + number
+    os.kill(process, number)
+    assert forks.wait() == 128 + number
     assert time.monotonic() - start < 10.0
     assert len(rows(path)) == 3
     assert run(CONFIG, path, resume=True).finished
