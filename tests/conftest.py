@@ -44,9 +44,11 @@ def drawn() -> None:
 @pytest.fixture(autouse=True)
 def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every episode's figure is an empty one, which is written all the same."""
-    show = sys.modules.get("phihp_torchrl.evaluation.show")
-    if show is not None and "drawn" not in request.fixturenames:
-        monkeypatch.setattr(show, "episode_figure", lambda *_, **__: Figure(figsize=(1, 1)))
+    if "drawn" in request.fixturenames:
+        return
+    for name in ("phihp_torchrl.evaluation.show", "phihp_torchrl.trainers.rehearsal"):
+        if (module := sys.modules.get(name)) is not None:
+            monkeypatch.setattr(module, "episode_figure", lambda *_, **__: Figure(figsize=(1, 1)))
 
 
 @pytest.fixture
