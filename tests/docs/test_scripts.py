@@ -18,21 +18,24 @@ EXPECTED = {
 RUN = """
 import multiprocessing.context as contexts, runpy, sys
 forked = contexts._concrete_contexts["forkserver"]
-forked.set_forkserver_preload(["torchrl.collectors", "phihp_torchrl.planners"])
+forked.set_forkserver_preload(["torchrl.collectors", "phihp_torchrl.planners", "seeds"])
 contexts._concrete_contexts["spawn"] = forked
 for script in sys.argv[1:]:
     runpy.run_path(script, run_name="__main__")
 """
 """One process after the other; their workers begin where TorchRL is imported already.
 
-A worker is sent what a spawned one is, and imports the script itself.
+A worker is sent what a spawned one is, imports the script itself, and has seeds of its own.
 """
+SEEDS = "import os, torch; os.register_at_fork(after_in_child=torch.seed)"
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)  # importing TorchRL takes long where many share the machine
 def test_scripts_print_what_the_page_says(place):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    (place / "seeds.py").write_text(SEEDS)
+    paths = os.pathsep.join([str(place), str(ROOT)])
+    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", RUN, *EXPECTED],
         cwd=place,

@@ -21,7 +21,6 @@ from measures import read_curve
 from phihp_torchrl.config import ConfigError
 from report import read_run
 
-
 BRIEF_SCRIPT = """
 import runpy, sys
 from pytest import MonkeyPatch
