@@ -29,6 +29,16 @@ def offer(group: str, name: str, content: Mapping[str, Any]) -> None:
     _OFFERED[group, name] = dict(content)
 
 
+def offered() -> str:
+    """All that is offered, as a text that differs where anything does."""
+    return repr(_OFFERED)
+
+
+def groups() -> set[str]:
+    """The names of all groups, those of directories and those of offers."""
+    return {path.name for path in YAML.iterdir() if path.is_dir()} | {of for of, _ in _OFFERED}
+
+
 def publish_offers(*config_dirs: str | Path) -> None:
     """Register with Hydra every offered choice without a YAML file here or in ``config_dirs``."""
     store = ConfigStore.instance()
@@ -46,13 +56,13 @@ def published_offers(*config_dirs: str | Path) -> Iterator[None]:
     groups, must not find them.
     """
     repo = ConfigStore.instance().repo
-    groups = {group for group, _ in _OFFERED}
-    before = {group: dict(repo[group]) for group in groups if group in repo}
+    names = {group for group, _ in _OFFERED}
+    before = {group: dict(repo[group]) for group in names if group in repo}
     publish_offers(*config_dirs)
     try:
         yield
     finally:
-        for group in groups:
+        for group in names:
             repo.pop(group, None)
         repo.update(before)
 

@@ -7,14 +7,17 @@ Hydra composes the files. Nothing here imports torch, so that ``--help`` answers
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_module
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -22,7 +25,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from phihp_torchrl.config.choices import choices_of, published_offers
+from phihp_torchrl.config.choices import choices_of, groups, offered, published_offers
 from phihp_torchrl.config.errors import ConfigError
 from phihp_torchrl.config.typed import flatten
 
@@ -82,16 +85,13 @@ def compose_yaml(overrides: Sequence[str], config_dir: str | Path | None = None)
         ConfigError: for a key, value or file that Hydra refuses; the message names it.
     """
     lines = open_mappings(overrides)
-    places = [] if config_dir is None else [config_dir]
-    if config_dir is not None:
-        lines.append(f"hydra.searchpath=[{_quoted(f'file://{Path(config_dir).absolute()}')}]")
     try:
-        with (
-            published_offers(*places),
-            _apart(),
-            initialize_config_module(MODULE, version_base="1.3"),
-        ):
-            return compose("train", lines)
+        if config_dir is not None:
+            return _compose(lines, config_dir)
+        chosen, values = _split(lines)
+        composed = copy.deepcopy(_compose_once(tuple(chosen), offered()))
+        ConfigLoaderImpl._apply_overrides_to_config(values, composed)
+        return composed
     except (HydraException, OmegaConfBaseException) as error:
         raise _explain(overrides, config_dir, error) from error
 
@@ -107,6 +107,40 @@ def _apart() -> Iterator[None]:
         GlobalHydra.instance().hydra = outer
 
 
+@lru_cache(maxsize=32)
+def _compose_once(lines: tuple[str, ...], offers: str) -> Any:
+    """Compose choices of groups; a process often needs the same ones with other values."""
+    return _compose(lines)
+
+
+def _compose(lines: Sequence[str], config_dir: str | Path | None = None) -> Any:
+    places = [] if config_dir is None else [config_dir]
+    if config_dir is not None:
+        path = _quoted(f"file://{Path(config_dir).absolute()}")
+        lines = [*lines, f"hydra.searchpath=[{path}]"]
+    with (
+        published_offers(*places),
+        _apart(),
+        initialize_config_module(MODULE, version_base="1.3"),
+    ):
+        return compose("train", [*lines])
+
+
+def _split(lines: Sequence[str]) -> tuple[list[str], list[Override]]:
+    """Words that decide which files are composed, and those that set values in what they make."""
+    known = {*_GROUPS, *groups()}
+    parsed = OverridesParser.create().parse_overrides(list(lines))
+    chosen, values = [], []
+    for word, line in zip(lines, parsed, strict=True):
+        key = override_key(line)
+        of_hydra = key in known or key.startswith("hydra") or "/" in key or line.package
+        if of_hydra or line.is_sweep_override():
+            chosen.append(word)
+        else:
+            values.append(line)
+    return chosen, values
+
+
 def _explain(
     overrides: Sequence[str], config_dir: str | Path | None, error: Exception
 ) -> ConfigError:
@@ -117,9 +151,9 @@ def _explain(
             chosen, known = str(lines[group].value()), choices_of(group, config_dir)
             if chosen not in known:
                 return ConfigError(group, f"expected one of {known}, got {chosen!r}.")
-    groups = [word for word in overrides if word.split("=", 1)[0] in _GROUPS]
-    if len(groups) < len(overrides):  # otherwise a choice is wrong and not a key
-        composed: Any = OmegaConf.to_container(compose_yaml(groups, config_dir))
+    choices = [word for word in overrides if word.split("=", 1)[0] in _GROUPS]
+    if len(choices) < len(overrides):  # otherwise a choice is wrong and not a key
+        composed: Any = OmegaConf.to_container(compose_yaml(choices, config_dir))
         known_keys = flatten(composed)
         for key in lines:
             if key not in (*_GROUPS, *known_keys) and not key.startswith(("hydra", "world.")):
@@ -164,15 +198,19 @@ def apply_overrides(config: Mapping[str, Any], overrides: Sequence[str]) -> dict
         >>> apply_overrides({"policy": {"updates": 8000}}, ["policy.updates=10"])
         {'policy': {'updates': 10}}
     """
-    changed = OmegaConf.create(dict(config))
-    for line in parse_overrides(overrides):
+    lines = parse_overrides(overrides)
+    sections = {re.split(r"[.\[]", override_key(line))[0] for line in lines}
+    if any("${" in word for word in overrides):  # a value of any section
+        sections = set(config)
+    changed = OmegaConf.create({key: config[key] for key in config if key in sections})
+    for line in lines:
         key = override_key(line)
         if key in _NAMES:
             changed[key] = str(line.value())
         elif key not in _GROUPS and not key.startswith("hydra"):
             OmegaConf.update(changed, key, line.value(), force_add=True)
     plain: Any = OmegaConf.to_container(changed, resolve=True)
-    return plain
+    return {**copy.deepcopy(dict(config)), **plain}
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Override]:

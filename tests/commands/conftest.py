@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from brief import shorten
 from hydra.core.config_store import ConfigStore
 
 import phihp_torchrl.tdmpc  # noqa: F401  (its phase stays registered)
@@ -21,6 +22,11 @@ from phihp_torchrl.worlds import WORLDS
 RECIPES = Path(__file__).parents[2] / "recipes"
 
 Command = Callable[..., None]
+
+
+@pytest.fixture(autouse=True)
+def _brief_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    shorten(monkeypatch)
 
 
 @pytest.fixture

@@ -50,6 +50,11 @@ columns:
 """
 
 
+@pytest.fixture(autouse=True)
+def _brief_episodes() -> None:
+    """Here episodes keep their length: the constants are found from whole swings."""
+
+
 def failed(phihp: Command, *words: str) -> str:
     with pytest.raises(SystemExit) as stopped:
         phihp("identify", *words)

@@ -110,7 +110,8 @@ def test_cem_then_evaluate(
     recipe: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small = ("planner.num_candidates=8", "planner.top_k=2", "planner.planning_horizon=2",
-             "planner.optim_steps=1", "planner.replan_every=2", *BRIEF)  # fmt: skip
+             "planner.optim_steps=1", "planner.replan_every=2", "compile=false",
+             *BRIEF)  # fmt: skip
     recipe("cem", "task=pendulum", "run_dir=run", *small)
     assert "| pendulum | 1 | 0 |" in capsys.readouterr().out
     recipe(*EVALUATE)

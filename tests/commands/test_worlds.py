@@ -69,21 +69,18 @@ def test_a_module_of_the_working_directory(
     assert not list((place / "other").rglob("*.csv"))
 
 
+GYM = ("world=gymnasium", "world.id=Pendulum-v1")
+TORCHRL = ("world=torchrl", "world.make=my_rig:make_env")
+
+
 @pytest.mark.usefixtures("rig")
 @pytest.mark.parametrize(
-    "world",
+    ("world", "words", "message"),
     [
-        pytest.param(("world=gymnasium", "world.id=Pendulum-v1"), id="gymnasium"),
-        pytest.param(("world=torchrl", "world.make=my_rig:make_env"), id="torchrl"),
-    ],
-)
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("method=td3",), r"^error: method: .*'td3'"),
-        (("method=ph-td-mpc-star",), r"^error: method: .*'ph-td-mpc-star'"),
-        (("method=cem-oracle",), r"^error: model\.kind: .*'oracle'"),
-        (("model.kind=oracle",), r"^error: model\.kind: .*'oracle'"),
+        (GYM, ("method=td3",), r"^error: method: .*'td3'"),
+        (TORCHRL, ("method=ph-td-mpc-star",), r"^error: method: .*'ph-td-mpc-star'"),
+        (GYM, ("method=cem-oracle",), r"^error: model\.kind: .*'oracle'"),
+        (TORCHRL, ("model.kind=oracle",), r"^error: model\.kind: .*'oracle'"),
     ],
 )
 def test_what_needs_a_truth_is_refused_before_any_step(

@@ -182,6 +182,20 @@ def test_names_may_be_words_or_arguments() -> None:
 # Overrides
 
 
+def test_a_composition_that_is_kept_is_no_other_ones() -> None:
+    """What is composed once in a process is not what somebody did to it, nor what was offered."""
+    before = load_config("pendulum")
+    changed = load_config("pendulum", overrides=["policy.updates=7", "+new.key=[1]"])
+    changed["planner"]["alpha"] = changed["policy"] = None
+    assert load_config("pendulum") == before
+    composed = compose_yaml(["task=pendulum"])
+    composed.policy.updates = 9
+    assert compose_yaml(["task=pendulum"]).policy.updates == before["policy"]["updates"]
+    for number in (1, 2):
+        offer("task", "kept-task", {"task": "kept-task", "seed": number})
+        assert load_config("kept-task")["seed"] == number
+
+
 def test_overrides_may_be_a_mapping() -> None:
     changes = {
         "policy.updates": 10,

@@ -79,51 +79,40 @@ def test_sentences_are_by_dotted_key() -> None:
     )
 
 
-CHECK = """
+RUN = """
 import sys
 from phihp_torchrl.commands import main
-{lines}
-heavy = sorted({{"torch", "torchrl", "tensordict", "wandb", "matplotlib"}} & set(sys.modules))
-print("imported", heavy)
+
+for lines in sys.argv[1:]:
+    exec(lines)
+    heavy = sorted({"torch", "torchrl", "tensordict", "wandb", "matplotlib"} & set(sys.modules))
+    print("imported", heavy, end="\\f")
 """
 
 
-def heavy_after(lines: str) -> tuple[str, list[str]]:
-    """What a new process prints, and which of the large packages it has imported."""
-    done = subprocess.run(
-        [sys.executable, "-c", CHECK.format(lines=lines)], capture_output=True, text=True
-    )
+def heavy_after(*lines: str) -> list[tuple[str, list[str]]]:
+    """What a new process prints after each line, and which large packages it has imported."""
+    done = subprocess.run([sys.executable, "-c", RUN, *lines], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    printed, _, heavy = done.stdout.rpartition("imported ")
-    return printed, re.findall(r"'(\w+)'", heavy)
+    parts = [part.rpartition("imported ") for part in done.stdout.split("\f")[:-1]]
+    return [(printed, re.findall(r"'(\w+)'", heavy)) for printed, _, heavy in parts]
 
 
-def test_the_check_for_imports_sees_what_is_imported() -> None:
-    """By the lightest of the large packages; torch takes many times longer."""
-    assert heavy_after("import matplotlib")[1] == ["matplotlib"]
+LIGHT = {
+    "main(['--help'])": "usage: phihp COMMAND",
+    "main(['train', '--help'])": "task=pendulum-swingup",
+    "main(['train', '-h', 'task=acrobot'])": "task=acrobot",
+    "main(['train', 'task=acrobot', '--cfg', 'job'])": "evaluation_interval",
+    "import phihp_torchrl as p; print(p.load_config('acrobot')['task'])": "acrobot",
+    "import gymnasium; print('phihp/Acrobot-v0' in gymnasium.registry)": "True",
+}
+"""What needs none of the large packages, and what it prints."""
 
 
-@pytest.mark.parametrize(
-    ("lines", "expected"),
-    [
-        ("main(['--help'])", "usage: phihp COMMAND"),
-        ("main(['train', '--help'])", "task=pendulum-swingup"),
-        ("main(['train', '-h', 'task=acrobot'])", "task=acrobot"),
-        ("main(['train', 'task=acrobot', '--cfg', 'job'])", "evaluation_interval"),
-        ("import phihp_torchrl as p; print(p.load_config('acrobot')['task'])", "acrobot"),
-        (
-            "import gymnasium, phihp_torchrl; print('phihp/Acrobot-v0' in gymnasium.registry)",
-            "True",
-        ),
-    ],
-)
-def test_help_needs_no_torch(lines: str, expected: str) -> None:
-    printed, heavy = heavy_after(lines)
-    assert expected in printed
-    assert not heavy
-
-
-def test_evaluate_and_export_tell_their_settings() -> None:
-    for command, setting in (("evaluate", "latency_actions"), ("export", "tolerance")):
-        printed, _ = heavy_after(f"main(['{command}', '--help'])")
-        assert setting in printed
+def test_help_needs_no_torch() -> None:
+    """The last line shows that the check sees what is imported, by the lightest of them."""
+    *found, last = heavy_after(*LIGHT, "import matplotlib")
+    for (printed, heavy), (line, expected) in zip(found, LIGHT.items(), strict=True):
+        assert expected in printed, line
+        assert not heavy, line
+    assert last[1] == ["matplotlib"]

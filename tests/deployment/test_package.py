@@ -17,7 +17,12 @@ from phihp_torchrl.deployment import AgentError, package
 from phihp_torchrl.planners import CEMConfig
 
 CONFIG = CEMConfig(
-    planning_horizon=2, num_candidates=8, top_k=3, num_policy_candidates=2, warm_start=True
+    planning_horizon=2,
+    optim_steps=2,
+    num_candidates=8,
+    top_k=3,
+    num_policy_candidates=2,
+    warm_start=True,
 )
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import runpy
 import socket
 import struct
-import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -64,13 +64,14 @@ def test_a_plant_without_an_answer_misses_every_tick_but_the_first():
     assert numbers == [(0, 0), (1, 1), (2, 2), (3, 3), (4, 4), (5, 5)]
 
 
-def threaded(controller: Controller, rate: float, seconds: float) -> tuple[int, int]:
-    """What the recipe plays, with the plant in a thread: a process takes long to start."""
+@contextmanager
+def threaded(name: str, rate: float, seconds: float) -> Iterator[socket.socket]:
+    """The recipe's plant in a thread: a process takes long to start."""
+    assert name == "pendulum"
     with listen() as line:
         thread = plant(line, rate, round(rate * seconds))
-        played = RECIPE["control"](controller, line)
+        yield line
         thread.join(5.0)
-    return played
 
 
 @pytest.fixture
@@ -86,7 +87,7 @@ OPTIONS = ("--rates", "50", "--seconds", "0.2")
 def test_the_recipe_plays_by_plan_and_by_actor(
     saved: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(RECIPE["main"].__globals__, "play", threaded)
+    monkeypatch.setitem(RECIPE["main"].__globals__, "simulated_plant", threaded)
     monkeypatch.setattr(sys, "argv", ["socket_loop.py", str(saved), *OPTIONS])
     RECIPE["main"]()
     rows = capsys.readouterr().out.strip().splitlines()[2:]
@@ -95,12 +96,15 @@ def test_the_recipe_plays_by_plan_and_by_actor(
 
 
 @pytest.mark.slow
-def test_what_measures_it_has_the_plant_in_a_process(saved: Path, tmp_path: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+def test_what_measures_it_has_the_plant_in_a_process(
+    saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "realtime"
     script = ROOT / "benchmarks" / "paper" / "control_loops.py"
-    words = ["--agent", saved, "--out", out, "--acting", "actor", *OPTIONS]
-    subprocess.run([sys.executable, script, *words], env=environment, check=True)
+    words = ["--agent", str(saved), "--out", str(out), "--acting", "actor", *OPTIONS]
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "argv", [str(script), *words])
+    runpy.run_path(str(script), run_name="__main__")
     (row,) = json.loads((out / "realtime.json").read_text())["rows"]
     assert (row["acting"], row["ticks"]) == ("actor", 10)
     assert "| actor | 50 | 10 |" in (out / "README.md").read_text()

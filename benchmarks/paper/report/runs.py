@@ -19,6 +19,8 @@ from measures import CurvePoint, configuration_hash, curve_from_metrics, read_cu
 from phihp_torchrl.evaluation import BASELINES_KEY
 from phihp_torchrl.origin import commit_text, machine_text
 
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # a report reads hundreds of files
+
 
 @dataclass(frozen=True)
 class Acting:
@@ -120,7 +122,7 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
     if missing := [n for n in ("config.yaml", "metadata.json", "evaluation.json", "metrics.csv")
                    if not (folder / n).is_file()]:  # fmt: skip
         raise ValueError(f"the run is not finished: {', '.join(missing)} is missing.")
-    config = yaml.safe_load((folder / "config.yaml").read_text())
+    config = yaml.load((folder / "config.yaml").read_text(), Loader=_LOADER)
     metadata = _read_json(folder / "metadata.json")
     cell = _read_json(folder / "cell.json") if (folder / "cell.json").is_file() else {}
     session = metadata["sessions"][0]

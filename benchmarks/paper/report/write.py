@@ -53,5 +53,5 @@ def _draw(picture: Picture, directory: Path) -> None:
         picture.figure.savefig(path, metadata={"Date": None})
     # matplotlib leaves spaces at the ends of lines.
     path.write_text(re.sub(r" +$", "", path.read_text(), flags=re.MULTILINE))
-    picture.figure.set_layout_engine("none")  # it stands; to lay it out takes most of the time
+    picture.figure.set_layout_engine(None)  # it stands; to lay it out takes most of the time
     picture.figure.savefig(path.with_suffix(".png"), dpi=100)

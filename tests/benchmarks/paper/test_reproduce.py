@@ -7,14 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from brief import shorten
 from grid_cells import TINY, do
 
 import reproduce
 from grid import CellFiles, GridConfig, Status
 
 
-@pytest.fixture
-def committed(tmp_path: Path) -> CellFiles:
+@pytest.fixture(scope="module")
+def committed(tmp_path_factory: pytest.TempPathFactory) -> CellFiles:
+    """A finished cell, only to be read."""
+    place = tmp_path_factory.mktemp("committed")
     config = GridConfig(
         "phihp",
         "pendulum",
@@ -22,10 +25,12 @@ def committed(tmp_path: Path) -> CellFiles:
         share=0.03,
         overrides=TINY,
         allow_dirty=True,
-        runs=str(tmp_path / "runs"),
-        results=str(tmp_path / "kept"),
+        runs=str(place / "runs"),
+        results=str(place / "kept"),
     )
-    assert do(config).status is Status.DONE
+    with pytest.MonkeyPatch.context() as patch:
+        shorten(patch)
+        assert do(config).status is Status.DONE
     return config.files(Path())
 
 

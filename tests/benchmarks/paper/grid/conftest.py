@@ -7,9 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from brief import shorten
 from grid_cells import TINY, do
 
 from grid import GridConfig, Status
+
+
+@pytest.fixture(autouse=True)
+def _brief_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    shorten(monkeypatch)
 
 
 def cell(place: Path) -> GridConfig:
@@ -37,7 +43,9 @@ def config(tmp_path: Path) -> GridConfig:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> GridConfig:
     """A finished cell, only to be read."""
     config = cell(tmp_path_factory.mktemp("whole"))
-    assert do(config).status is Status.DONE
+    with pytest.MonkeyPatch.context() as patch:
+        shorten(patch)
+        assert do(config).status is Status.DONE
     return config
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -12,13 +13,24 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from grid_cells import PAPER, TINY, do, returns, words
+from grid_cells import PAPER, ROOT, TINY, do, returns, words
 
 from grid import GridConfig, Status, claim, is_claimed, keep, look, work
 from grid.display import failures
 from measures import read_curve
 from phihp_torchrl.config import ConfigError
 from report import read_run
+
+BRIEF_SCRIPT = """
+import runpy, sys
+from pytest import MonkeyPatch
+from brief import shorten
+shorten(MonkeyPatch())
+sys.argv = sys.argv[1:]
+sys.path.insert(0, sys.argv[0].rpartition("/")[0])
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+"""A script in a process whose episodes are as short as in these tests."""
 
 
 def test_a_cell_is_run_once_and_what_is_small_is_kept(config: GridConfig) -> None:
@@ -190,6 +202,8 @@ def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
     quoted = ",".join(f'"{override}"' for override in overrides)
     command = [
         sys.executable,
+        "-c",
+        BRIEF_SCRIPT,
         str(PAPER / "run_grid.py"),
         "task=pendulum",
         "share=0.03",
@@ -197,7 +211,11 @@ def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
     ]
     command += [f"runs={config.runs}", f"results={config.results}", f"overrides=[{quoted}]"]
     metrics = config.files(Path()).run / "metrics.csv"
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL) as process:
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
+    ) as process:
         deadline = time.monotonic() + 120
         while time.monotonic() < deadline and process.poll() is None:
             if metrics.exists() and len(metrics.read_text().splitlines()) > 2:
@@ -246,12 +264,11 @@ def test_a_cell_that_failed_at_its_start_can_be_corrected(
 
 
 @pytest.mark.parametrize("also_in_full", [False, True])
-def test_a_torn_evaluation_is_not_done(config: GridConfig, also_in_full: bool) -> None:
-    do(config)
-    files = config.files(Path())
+def test_a_torn_evaluation_is_not_done(finished: GridConfig, also_in_full: bool) -> None:
+    files = finished.files(Path())
     text = files.evaluation.read_text()
     for path in (files.evaluation, *([files.run / "evaluation.json"] if also_in_full else [])):
         path.write_text(text[: len(text) // 2])
     assert look(files).status is not Status.DONE
-    assert do(config).status is Status.DONE
+    assert do(finished).status is Status.DONE
     assert files.evaluation.read_text() == text
