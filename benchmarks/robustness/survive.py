@@ -60,7 +60,7 @@ PHASES = ("model", "policy", "evaluate")
 OPERATIONS = ("replace", "rename", "fsync", "mkdir", "unlink", "rmdir")
 """Functions of ``os`` by which files come, move and go."""
 TINY = {
-    "checkpoint_interval": 0, "compile": False, "progress": False,
+    "checkpoint_interval": 0, "compile": False, "progress": False, "calibrate.enabled": False,
     "model.real_steps": 60, "model.steps_per_iteration": 30, "model.fit.steps": 2,
     "model.collect.planning_horizon": 3, "model.collect.replan_every": 2,
     "model.collect.num_candidates": 8, "model.collect.top_k": 2, "model.collect.optim_steps": 1,
