@@ -35,8 +35,8 @@ class CalibratePhase:
     the second half of the actor's episodes; then the actor takes over. In each round more steps are
     planned, by the better half of the settings. The first of the last round, the settings as given
     and the actor then play on from other states of both sorts, from more of them while it is in
-    doubt who is to act, and a rule chooses. All of this happens in the model, with the same starts and noise for
-    every setting, so no real step is taken.
+    doubt who is to act, and a rule chooses. All of this happens in the model, with the same starts
+    and noise for every setting, so no real step is taken.
 
     Args:
         agent: the agent, with model, actor and planner; it is not compiled.

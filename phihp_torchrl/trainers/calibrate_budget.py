@@ -42,8 +42,8 @@ def round_episodes(config: CalibrateConfig, planner: SearchConfig, count: int) -
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig
         >>> config = CalibrateConfig()
-        >>> [round_episodes(config, CEMConfig(steps), 8) for steps in (5, 10, 100)]
-        [6, 4, 3]
+        >>> [round_episodes(config, CEMConfig(steps), 9) for steps in (5, 8, 100)]
+        [6, 5, 3]
     """
     fits = [
         episodes

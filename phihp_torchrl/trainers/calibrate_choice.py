@@ -12,7 +12,6 @@ import torch
 from phihp_torchrl.planners import SearchConfig
 from phihp_torchrl.trainers.calibrate_rule import estimate
 
-
 # Std of the search near the previous plan, in units of the half-range.
 _NARROW = 0.1
 # Share of a step's reward below which a promise is rounding.
@@ -85,7 +84,7 @@ def grid(config: SearchConfig, promise: float, reward: float) -> list[dict[str, 
     Gaussian. So the calm settings go on from the previous plan, keep it unless another is better,
     and look for others nearby, with noise that is smooth along the plan. Where the actor holds a
     balance, a margin of twice what plans promise there leaves the actor alone; where plans promise
-    nothing, there is no margin to try.
+    nothing, there is no margin to try. Without a price the calm search has less of a steady error.
 
     Args:
         config: the planner's settings.
@@ -100,13 +99,14 @@ def grid(config: SearchConfig, promise: float, reward: float) -> list[dict[str, 
     """
     margin = {} if promise < _NOTHING * reward else {"actor_margin": _round(2 * promise)}
     standing = {"noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
-    reward = _round(reward)
-    calm = {"change_cost": reward, **standing, "init_std": min(_NARROW, config.init_std)}
+    reward, narrow = _round(reward), {"init_std": min(_NARROW, config.init_std)}
+    calm = {"change_cost": reward, **standing, **narrow}
     half = max(2, config.planning_horizon // 2)
     wanted: list[dict[str, Any]] = [
         {},
         margin,
         {"change_cost": _round(reward / 10), **standing, "init_std": min(0.3, config.init_std)},
+        {**standing, **narrow},
         calm,
         {**calm, **margin},
         {"change_cost": reward, **standing, **margin},
