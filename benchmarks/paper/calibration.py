@@ -2,11 +2,14 @@
 
     python benchmarks/paper/calibration.py --tasks pendulum cartpole
     python benchmarks/paper/calibration.py --only-imagine     # without evaluation episodes
+    python benchmarks/paper/calibration.py --keep             # play only what is new
     python benchmarks/paper/calibration.py --only-write       # the table of what there is
 
 Reads the agents in results/agents. The choice is made in imagination from seed 0, by the defaults
 of the section ``calibrate``. Afterwards, to report only, the planner as given, the one chosen and
-the actor play paired evaluation episodes. Writes results/calibration/{task}.json and README.md.
+the actor play paired evaluation episodes. With ``--keep`` those that were played before by the same
+agent with the same settings are not played again: a plan draws the same noise in them. Writes
+results/calibration/{task}.json and README.md.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,14 +45,23 @@ def calibrated(agent: Agent) -> dict[str, Any]:
     return {**phase.final, "cpu_seconds": time.process_time() - start}
 
 
-def played(agent: Agent, changes: dict[str, Any]) -> dict[str, Any]:
-    """Returns and chatter of the planner as given, with ``changes`` and of the actor."""
+def played(agent: Agent, changes: dict[str, Any], kept: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns and chatter of the planner as given, with ``changes`` and of the actor.
+
+    Args:
+        agent: the agent.
+        changes: what calibration has changed.
+        kept: episodes that were played before, by who acts.
+    """
     assert agent.planner_config is not None
     ways = {"given": agent.planner_config, "chosen": replace(agent.planner_config, **changes)}
     results: dict[str, Any] = {}
     for name, config in {**ways, "actor": None}.items():
         if name == "chosen" and not changes:
             results[name] = results["given"]
+            continue
+        if name in kept:
+            results[name] = kept[name]
             continue
         acting = agent.with_planner(config)
         found = evaluate(acting, agent.task, episodes=EPISODES, seed=EVALUATION_SEED)
@@ -59,6 +71,15 @@ def played(agent: Agent, changes: dict[str, Any]) -> dict[str, Any]:
             "chatter": found.chatter.mean().item(),
         }
     return results
+
+
+def kept_episodes(path: Path, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Those in the file of a task that need not be played again for what was found anew."""
+    before = json.loads(path.read_text()) if path.is_file() else {}
+    world = dict(before.get("world", {}))
+    if before.get("changes") != found["changes"]:
+        world.pop("chosen", None)
+    return world
 
 
 def acting(found: dict[str, Any]) -> str:
@@ -146,18 +167,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
     parser.add_argument("--only-imagine", action="store_true", help="play no evaluation episode")
+    parser.add_argument("--keep", action="store_true", help="play only what was not played before")
     parser.add_argument("--only-write", action="store_true", help="write the table alone")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     RESULTS.mkdir(parents=True, exist_ok=True)
     for task in [] if arguments.only_write else arguments.tasks:
-        agent = load_agent(AGENTS / task, planner=True)
+        agent, path = load_agent(AGENTS / task, planner=True), RESULTS / f"{task}.json"
         found = calibrated(agent)
         found["origin"] = origin_text(describe_origin(SEED))
         if not arguments.only_imagine:
-            found["world"] = played(agent, found["changes"])
-        (RESULTS / f"{task}.json").write_text(json.dumps(found, indent=1) + "\n")
+            kept = kept_episodes(path, found) if arguments.keep else {}
+            found["world"] = played(agent, found["changes"], kept)
+        path.write_text(json.dumps(found, indent=1) + "\n")
         write_all()
     if arguments.only_write:
         write_all()

@@ -195,11 +195,23 @@ def measure(policy: Policy, task: Task, episodes: int) -> dict[str, dict[str, fl
     return found
 
 
-def train(name: str, seed: int, updates: int, place: Path) -> Agent:
-    """The agent in ``place``, which is learned with the settings above if it is not there."""
+def train(name: str, seed: int, updates: int, place: Path, models: Path | None = None) -> Agent:
+    """The agent in ``place``, which is learned with the settings above if it is not there.
+
+    Args:
+        name: the task.
+        seed: of training.
+        updates: of the critics.
+        place: where agents are kept.
+        models: where there are runs that have done the phase model, ``{task}-{seed}``; for
+            ``None`` the model is learned too.
+    """
     directory = place / f"{name}-{seed}-{updates}"
     if not directory.exists():
         settings = {**SETTINGS, "seed": seed, "policy.updates": updates}
+        if models is not None:
+            settings |= {"from": f"{models / f'{name}-{seed}'}"}
+            settings |= {"phases": ["policy", "calibrate", "evaluate"]}
         begun = time.perf_counter()
         with tempfile.TemporaryDirectory() as run:
             agent = learn(name, overrides=settings, run_dir=f"{run}/run").agent
@@ -258,6 +270,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--agents", type=Path, default=AGENTS, help="where agents are kept")
+    parser.add_argument("--models", type=Path, help="runs that have done the phase model")
     arguments = parser.parse_args(words)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
@@ -281,7 +294,7 @@ def main(words: Sequence[str] | None = None) -> None:
     )
     for seed in arguments.seeds:
         for name in arguments.tasks:
-            agent = train(name, seed, arguments.updates, arguments.agents)
+            agent = train(name, seed, arguments.updates, arguments.agents, arguments.models)
             task, config = get_task(name), agent.planner_config
             assert config is not None
             settled = agent.with_planner(replace(config, **SETTLED))
@@ -298,6 +311,7 @@ def main(words: Sequence[str] | None = None) -> None:
                     "updates": arguments.updates,
                     "settings": SETTINGS,
                     "settled": SETTLED,
+                    "calibration": agent.metadata.get("calibration"),
                     "episodes": episodes,
                     "measured": measured,
                     "origin": describe_origin(seed),

@@ -34,9 +34,9 @@ class CalibratePhase:
     Every setting of a short grid plans for some steps, from the task's starts and from states in
     the second half of the actor's episodes; then the actor takes over. In each round more steps are
     planned, by the better half of the settings. The first of the last round, the settings as given
-    and the actor then play episodes from other starts, more of them while it is in doubt who is to
-    act, and a rule chooses. All of this happens in the model, with the same starts and noise for
-    every setting, so no real step is taken.
+    and the actor then play on from other states of both sorts, from more of them while it is in
+    doubt who is to act, and a rule chooses. All of this happens in the model, with the same starts
+    and noise for every setting, so no real step is taken.
 
     Args:
         agent: the agent, with model, actor and planner; it is not compiled.
@@ -152,13 +152,16 @@ class CalibratePhase:
         task, episodes = self.agent.task, self._episodes
         generator = torch.Generator().manual_seed(self.seed)
         device = next(self.agent.parameters()).device
-        counts = (episodes, episodes, self.config.max_episodes)
+        most = self.config.max_episodes
+        counts = (episodes + most, episodes, most)
         starts = [task.sample_start([count], generator).to(device) for count in counts]
         played = Player(self.actor, self.world_model, starts[0]).play(task.max_steps)
-        share = 0.5 + 0.5 * torch.rand(_PROMISES, episodes, generator=generator).to(device)
+        share = 0.5 + 0.5 * torch.rand(_PROMISES, counts[0], generator=generator).to(device)
         index = (share * played.lengths).long()
         late = played.states.gather(0, index[..., None].expand(-1, -1, task.state_dim))
-        self._starts, self.end.starts = torch.cat([starts[1], late[0]]), starts[2]
+        self._starts = torch.cat([starts[1], late[0, :episodes]])
+        self.end.starts, self.end.late = starts[2], late[0, episodes:]
+        late = late[:, :episodes]
         steps = self.config.rounds[-1] + self.config.follow_steps
         self._of_actor = Player(self.actor, self.world_model, self._starts).play(steps).total
         reward = (played.total / played.lengths).abs().mean().item()

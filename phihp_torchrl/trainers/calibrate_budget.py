@@ -7,6 +7,8 @@ from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 
 # What a call of the model costs beside its transitions, in transitions.
 _CALL = 1000
+# Episodes below which a standard error says little.
+_LEAST = 3
 
 
 def plan_cost(planner: SearchConfig, rows: int) -> float:
@@ -35,24 +37,26 @@ def rounds_cost(config: CalibrateConfig, planner: SearchConfig, episodes: int, c
 
 
 def round_episodes(config: CalibrateConfig, planner: SearchConfig, count: int) -> int:
-    """Episodes of the rounds: as many as half of the budget pays, two at least.
+    """Episodes of the rounds: as many as half of the budget pays, three at least.
 
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig
         >>> config = CalibrateConfig()
-        >>> [round_episodes(config, CEMConfig(steps), 11) for steps in (10, 40, 100)]
-        [6, 3, 2]
+        >>> [round_episodes(config, CEMConfig(steps), 9) for steps in (5, 8, 100)]
+        [6, 5, 3]
     """
     fits = [
         episodes
-        for episodes in range(2, config.episodes + 1)
+        for episodes in range(_LEAST, config.episodes + 1)
         if rounds_cost(config, planner, episodes, count) <= config.budget / 2
     ]
-    return max(fits, default=2)
+    return max(fits, default=min(_LEAST, config.episodes))
 
 
 def final_steps(config: CalibrateConfig, planner: SearchConfig, rest: float, longest: int) -> int:
     """Steps that two plans play at the end, before the actor takes over.
+
+    They take half of what is left: the other half is for more episodes, in doubt.
 
     Args:
         config: settings of the phase.
@@ -60,5 +64,5 @@ def final_steps(config: CalibrateConfig, planner: SearchConfig, rest: float, lon
         rest: what the rounds have left of the budget.
         longest: steps of a whole episode.
     """
-    affordable = int(rest / (2 * plan_cost(planner, config.episodes)))
+    affordable = int(rest / 2 / (2 * plan_cost(planner, 2 * config.episodes)))
     return min(longest, max(config.rounds[-1], affordable))

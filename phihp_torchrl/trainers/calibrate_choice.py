@@ -12,6 +12,11 @@ import torch
 from phihp_torchrl.planners import SearchConfig
 from phihp_torchrl.trainers.calibrate_rule import estimate
 
+# Std of the search near the previous plan, in units of the half-range.
+_NARROW = 0.1
+# Share of a step's reward below which a promise is rounding.
+_NOTHING = 1e-3
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -75,7 +80,11 @@ def rank(trials: Sequence[Trial]) -> list[Trial]:
 def grid(config: SearchConfig, promise: float, reward: float) -> list[dict[str, Any]]:
     """The settings that are compared, as changes of ``config``; a key that it lacks is left out.
 
-    Margins are in units of ``promise``, prices of ``reward``, because both are in the task's units.
+    A price of changes alone leaves the noise of the search: the mean of a few elites of a wide
+    Gaussian. So the calm settings go on from the previous plan, keep it unless another is better,
+    and look for others nearby, with noise that is smooth along the plan. Where the actor holds a
+    balance, a margin of twice what plans promise there leaves the actor alone; where plans promise
+    nothing, there is no margin to try. Without a price the calm search has less of a steady error.
 
     Args:
         config: the planner's settings.
@@ -85,29 +94,22 @@ def grid(config: SearchConfig, promise: float, reward: float) -> list[dict[str, 
 
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig
-        >>> [list(changes) for changes in grid(CEMConfig(), 1.0, 1.0)][:3]
-        [[], ['actor_margin'], ['actor_margin']]
+        >>> grid(CEMConfig(), 1.0, 1.0)[:2]
+        [{}, {'actor_margin': 2.0}]
     """
-    promise, reward = _round(promise), _round(reward)
-    margin = {"actor_margin": promise}
-    smooth = {
-        "change_cost": reward,
-        "noise_beta": 2.0,
-        "warm_start": True,
-        "keep_incumbent": True,
-        "incumbent_margin": _round(promise / 10),
-    }
+    margin = {} if promise < _NOTHING * reward else {"actor_margin": _round(2 * promise)}
+    standing = {"noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
+    reward, narrow = _round(reward), {"init_std": min(_NARROW, config.init_std)}
+    calm = {"change_cost": reward, **standing, **narrow}
     half = max(2, config.planning_horizon // 2)
     wanted: list[dict[str, Any]] = [
         {},
         margin,
-        {"actor_margin": 2 * promise},
-        {"change_cost": _round(reward / 10)},
-        {"change_cost": reward},
-        {"change_cost": reward, "noise_beta": 2.0},
-        {"change_cost": reward, **margin},
-        smooth,
-        {**smooth, **margin},
+        {"change_cost": _round(reward / 10), **standing, "init_std": min(0.3, config.init_std)},
+        {**standing, **narrow},
+        calm,
+        {**calm, **margin},
+        {"change_cost": reward, **standing, **margin},
         {"alpha": config.alpha / 2, **margin},
         {"planning_horizon": half, **margin},
     ]

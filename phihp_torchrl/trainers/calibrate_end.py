@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from phihp_torchrl.deployment import Agent
@@ -13,7 +14,7 @@ from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.trainers.calibrate_budget import final_steps, plan_cost
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_rule import Choice, Finalist, choose
-from phihp_torchrl.trainers.imagined_play import Player
+from phihp_torchrl.trainers.imagined_play import Played, Player
 
 
 class End:
@@ -29,6 +30,8 @@ class End:
 
     starts: Tensor
     """First states, ``[config.max_episodes, n]``."""
+    late: Tensor
+    """States in the second half of the actor's episodes, of the same shape."""
 
     def __init__(
         self,
@@ -61,37 +64,43 @@ class End:
         if not self.next_episodes:
             return False
         plans, steps = len(self.changes), max(lot["steps"] for lot in self.lots)
-        following = plans * steps * plan_cost(self.base, self.next_episodes)
+        following = plans * steps * plan_cost(self.base, 2 * self.next_episodes)
         spent = self.spent + sum(lot["cost"] for lot in self.lots)
         return spent + following <= self.config.budget
 
     def play(self) -> None:
         """Let every finalist and the actor play the next lot."""
         first, count = self.episodes, self.next_episodes
-        starts, seed = self.starts[first : first + count], self.seed + first
+        lot, seed = slice(first, first + count), self.seed + first
+        starts = torch.cat([self.starts[lot], self.late[lot]])
         of, cost, longest = {}, 0.0, 0
         for name, changes in self.changes.items():
             agent = self.agent.with_planner(replace(self.base, **changes))
             player = Player(agent, self.world_model, starts, seed)
             played = player.play(self.steps)
-            total = player.followed_by(self.actor, self.longest - self.steps)
-            of[name] = (total, played.chatter(played.lengths // 2))
+            of[name] = self._found(player, played, count)
             longest = max(longest, len(played.changes))
-            cost += len(played.changes) * plan_cost(self.base, count)
-        played = Player(self.actor, self.world_model, starts).play(self.longest)
-        of["actor"] = (played.total, played.chatter(played.lengths // 2))
+            cost += len(played.changes) * plan_cost(self.base, 2 * count)
+        player = Player(self.actor, self.world_model, starts)
+        of["actor"] = self._found(player, player.play(self.steps), count)
         plain = {name: [row.tolist() for row in rows] for name, rows in of.items()}
         self.lots.append({"episodes": count, "steps": longest, "cost": cost, "of": plain})
+
+    def _found(self, player: Player, played: Played, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns of episodes, chatter late in them, and returns of the late stretches."""
+        total = player.followed_by(self.actor, self.longest - self.steps)
+        chatter = played.chatter(played.lengths // 2)
+        return total[:count], chatter[count:], total[count:]
 
     def finalists(self) -> dict[str, Finalist]:
         """What each has earned in all lots."""
         found = {}
         for name in (*self.changes, "actor"):
-            returns, chatter = (
+            returns, chatter, late = (
                 tuple(value for lot in self.lots for value in lot["of"][name][index])
-                for index in (0, 1)
+                for index in range(3)
             )
-            found[name] = Finalist(returns, chatter, self.changes.get(name, {}))
+            found[name] = Finalist(returns, chatter, self.changes.get(name, {}), late)
         return found
 
     def choice(self) -> Choice:

@@ -12,10 +12,8 @@ from torch import Tensor
 
 # Of the plan's gain over the actor, what smoothness may cost.
 _SHARE = 0.1
-# Of a paired standard error, what smoothness may cost.
-_DOUBT = 0.5
 # Chatter of the smoother plan, as a share of the other's; and the least difference of the two.
-_SMOOTHER, _NOTICEABLE = 0.5, 0.01
+_SMOOTHER, _NOTICEABLE = 2 / 3, 0.01
 
 
 @dataclass(frozen=True)
@@ -26,11 +24,13 @@ class Finalist:
         returns: return of each episode, from the same starts and with the same noise for all.
         chatter: mean change of the action in each, in units of the half-range.
         changes: what it changes in the settings of the planner.
+        late: return of each stretch from the second half of the actor's episodes; none by default.
     """
 
     returns: tuple[float, ...]
     chatter: tuple[float, ...]
     changes: Mapping[str, Any] = field(default_factory=dict)
+    late: tuple[float, ...] = ()
 
     @property
     def mean_chatter(self) -> float:
@@ -40,12 +40,18 @@ class Finalist:
     @property
     def fails(self) -> bool:
         """Whether a return is not finite."""
-        return not all(map(math.isfinite, self.returns))
+        return not all(map(math.isfinite, self.returns + self.late))
 
     def ahead_of(self, other: Finalist) -> tuple[float, float]:
-        """Mean paired difference of the returns, and its standard error."""
-        ours, theirs = (torch.tensor(each.returns).double() for each in (self, other))
-        return estimate((ours - theirs)[None])
+        """Mean paired difference of the returns, late ones added, and its standard error."""
+        rows = [self.returns, self.late] if self.late else [self.returns]
+        against = [other.returns, other.late] if self.late else [other.returns]
+        return estimate(torch.tensor(rows).double() - torch.tensor(against).double())
+
+    def smoother_than(self, other: Finalist) -> bool:
+        """Whether its chatter is clearly less: two thirds at most."""
+        ours, theirs = self.mean_chatter, other.mean_chatter
+        return ours <= _SMOOTHER * theirs and theirs - ours >= _NOTICEABLE
 
 
 class Choice(NamedTuple):
@@ -76,13 +82,13 @@ def choose(
     The plan as given stays unless the other one
 
     - earns more, by over ``confidence`` standard errors of the paired differences, or
-    - is clearly smoother, with at most half the chatter, and does not earn less by more than a
-      tenth of the given plan's gain over the actor, nor by more than half a standard error.
+    - is clearly smoother, with at most two thirds of the chatter, and does not earn less by more
+      than a tenth of the given plan's gain over the actor.
 
-    The plan that is chosen acts if its mean gain over the actor is above one standard error. Above
-    ``confidence`` of them this is certain; so is a gain of exactly zero, where the two do the same
-    and the actor, which is cheaper, acts. All else is doubtful and deserves more episodes before
-    the actor replaces a plan.
+    The plan that is chosen acts if its mean gain over the actor is above one standard error, or if
+    it earns no less and is clearly smoother. Above ``confidence`` standard errors this is certain;
+    so is a gain of exactly zero, where the two do the same and the actor, which is cheaper, acts.
+    All else is doubtful and deserves more episodes before the actor replaces a plan.
 
     One other plan is compared and not a dozen, because the best of a dozen looks better than it is.
     The one that enters here was picked by other episodes, so its differences here are not favoured
@@ -107,15 +113,13 @@ def choose(
     plan, reason = given, "as given"
     if other is not None:
         ahead, error = other.ahead_of(given)
-        allowed = min(_SHARE * max(given.ahead_of(actor)[0], 0.0), _DOUBT * error)
-        chatter, less = given.mean_chatter, other.mean_chatter
-        smoother = less <= _SMOOTHER * chatter and chatter - less >= _NOTICEABLE
+        allowed = _SHARE * max(given.ahead_of(actor)[0], 0.0)
         if ahead > confidence * error or (given.fails and not other.fails):
             plan, reason = other, "better"
-        elif ahead >= -allowed and smoother:
+        elif ahead >= -allowed and other.smoother_than(given):
             plan, reason = other, "smoother"
     gain, error = plan.ahead_of(actor)
-    acts = gain > min(confidence, 1.0) * error
+    acts = gain > min(confidence, 1.0) * error or (gain >= 0.0 and plan.smoother_than(actor))
     certain = gain > confidence * error or gain == error == 0.0
     return Choice(plan, reason, "planner" if acts else "actor", certain, gain, error)
 

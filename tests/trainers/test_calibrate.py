@@ -10,11 +10,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, save_agent
+from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, load_config, save_agent
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
-from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, run
+from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, read_run_config, run
 from phihp_torchrl.trainers.calibrate_budget import final_steps
 from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
 
@@ -48,8 +48,10 @@ def finished(agent, config=TINY, seed=0, path=None):
 def test_the_grid_starts_with_the_settings_as_given_and_repeats_none():
     settings = grid(CEMConfig(), 1.234, 0.5)
     assert settings[0] == {}
-    assert {"actor_margin": 1.2} in settings
-    assert {"change_cost": 0.5} in settings
+    assert {"actor_margin": 2.5} in settings
+    calm = {"change_cost": 0.5, "noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
+    assert {**calm, "init_std": 0.1} in settings
+    assert {**calm, "init_std": 0.1, "actor_margin": 2.5} in settings
     for changes in settings:
         replace(CEMConfig(), **changes)
         assert settings.count(changes) == 1
@@ -63,7 +65,15 @@ def test_a_planner_is_asked_only_for_what_it_has():
         "noise_beta",
         "alpha",
         "planning_horizon",
+        "init_std",
     }
+
+
+def test_where_plans_promise_nothing_there_is_no_margin_to_try():
+    settings = grid(CEMConfig(), 1e-4, 0.5)
+    assert not any("actor_margin" in changes for changes in settings)
+    narrow = grid(replace(CEMConfig(), init_std=0.05), 1.0, 0.5)
+    assert all(changes.get("init_std", 0.05) == 0.05 for changes in narrow)
 
 
 def trial(mean, spread, chatter, name):
@@ -166,8 +176,24 @@ def test_the_budget_ends_doubt_and_shortens_plans():
     assert small.final["episodes"] == TINY.episodes
     assert small.final["steps"] == TINY.rounds[-1]
     assert final_steps(TINY, SMALL, rest=1e9, longest=20) == 20  # the whole episode
-    # Two plans, three calls each, of three rows with 32 candidates.
-    assert final_steps(TINY, SMALL, rest=8 * 2 * 3 * (1000 + 96), longest=20) == 8
+    # Two plans, three calls each, of six rows with 32 candidates, from half of what is left.
+    assert final_steps(TINY, SMALL, rest=2 * 8 * 2 * 3 * (1000 + 192), longest=20) == 8
+
+
+def test_late_stretches_count_and_chatter_is_theirs():
+    """A calm plan in another's place: the numbers of the end are those of both sorts of starts."""
+    phase = finished(make_agent())
+    of = phase.end.finalists()
+    for way in of.values():
+        assert len(way.returns) == len(way.late) == len(way.chatter) == phase.end.episodes
+    gains = [
+        ours - theirs
+        for rows in ("returns", "late")
+        for ours, theirs in zip(getattr(of["given"], rows), getattr(of["actor"], rows), strict=True)
+    ]
+    ahead, error = of["given"].ahead_of(of["actor"])
+    assert ahead == pytest.approx(sum(gains) / phase.end.episodes, rel=1e-4)
+    assert error > 0
 
 
 # The agent that is shipped.
@@ -187,6 +213,7 @@ def test_the_file_says_how_the_agent_acts(tmp_path, acting):
 
 @pytest.mark.slow
 def test_a_run_calibrates_before_it_evaluates(tmp_path):
+    assert read_run_config(load_config("pendulum")).section("calibrate").enabled
     config = with_sections(CONFIG, calibrate=TINY)
     result = run(config, tmp_path / "run")
     table = json.loads((tmp_path / "run" / "calibration.json").read_text())

@@ -6,6 +6,16 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+from calibration import kept_episodes
+
+
+def test_only_new_episodes_are_played_where_others_are_kept(tmp_path: Path) -> None:
+    path, world = tmp_path / "pendulum.json", {"given": 1, "chosen": 2, "actor": 3}
+    assert kept_episodes(path, {"changes": {}}) == {}
+    path.write_text(json.dumps({"changes": {"alpha": 0.5}, "world": world}))
+    assert kept_episodes(path, {"changes": {"alpha": 0.5}}) == world
+    assert kept_episodes(path, {"changes": {}}) == {"given": 1, "actor": 3}
+
 
 def test_the_tables_pair_the_episodes_and_name_what_was_not_run(
     run_script: Callable[..., None], tmp_path: Path
