@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from phihp_torchrl.identification.choose_integrator import choose_integrator
 from phihp_torchrl.identification.config import AUTO, IdentifyConfig
 from phihp_torchrl.identification.each_action import (
     delay_each,
@@ -19,9 +20,10 @@ from phihp_torchrl.identification.model import NEUTRAL, Model, part_of
 from phihp_torchrl.identification.parts import ActuatorTrial
 from phihp_torchrl.identification.second_look import choose_again, near
 from phihp_torchrl.identification.trials import Trial, Trials
-from phihp_torchrl.integrators import make_integrator
 from phihp_torchrl.tasks import Actuator, Numbers
 
+_PROMISING = 0.9
+"""Share of the cost below which a part may be needed together with others."""
 _ALIKE = 5.0
 """Ratio of the sizes of actions up to which they may be of one unit."""
 
@@ -61,11 +63,11 @@ class Chooser:
         """
         self.choose_path()
         self.choose_slew()
-        before = self.best.model.fitted
-        self.choose_parts()
-        if self.best.model.fitted != before:
-            choose_again(self)
-        self.choose_integrator()
+        before = self.best
+        promising = self.choose_parts()
+        if promising is not before:
+            choose_again(self, promising)
+        choose_integrator(self)
 
     def choose_path(self) -> None:
         """Delay and lag, of all actions together and then of each."""
@@ -151,8 +153,14 @@ class Chooser:
             if self.lower(trial) if lagging else self.trials.better(trial, self.best):
                 self.best, lagging = trial, False
 
-    def choose_parts(self) -> None:
-        """Unequal gains and a dead zone, of each action where several move."""
+    def choose_parts(self) -> Trial:
+        """Unequal gains and a dead zone, of each action where several move.
+
+        Returns:
+            The best trial, or one that costs less, though not clearly: what else the drive does may
+            hide that it is better.
+        """
+        promising = self.best
         action, moving = self.trials.samples.action, self.moving()
         each = list(moving) if len(moving) > 1 else [None] * len(moving)
         for part in ("gain_low", "dead_zone"):
@@ -164,7 +172,14 @@ class Chooser:
                 model = self.settled().with_part(part, start, i)
                 trial = self.consider(f"{self.best.part}, {model.fitted[-1]}", model)
                 if self.trials.better(trial, self.best):
-                    self.best = trial
+                    self.best = promising = trial
+                elif self._promises(trial, promising):
+                    promising = trial
+        return promising
+
+    def _promises(self, trial: Trial, than: Trial) -> bool:
+        cost = self.trials.cost
+        return cost(trial, self.best) < _PROMISING * cost(than, self.best)
 
     def drop(self, name: str) -> None:
         """Leave out a fitted part that is not clearly needed."""
@@ -174,32 +189,6 @@ class Chooser:
         trial = self.consider(f"without {name}", replace(model, fitted=fitted, path=path))
         if not self.trials.better(self.best, trial):
             self.best = trial
-
-    def choose_integrator(self) -> None:
-        """Runge-Kutta with as few substeps as do; a step of Euler's where the data were made so."""
-        config = self.config
-        settings = [("rk4", 1), ("rk4", 2), ("rk4", 4), ("semi_implicit_euler", 1)]
-        if config.substeps:
-            settings = [("rk4", config.substeps), ("semi_implicit_euler", config.substeps)]
-        elif config.integrator == "semi_implicit_euler":
-            settings += [(config.integrator, 2), (config.integrator, 4)]
-        settings = [s for s in settings if config.integrator in (AUTO, s[0])]
-        chosen: Trial | None = None
-        for name, substeps in settings:
-            integrator = make_integrator(name, substeps=substeps)
-            same = self.best.model.integrator
-            trial = self.best
-            if (name, substeps) != (same.name, same.settings["substeps"]):
-                model = replace(self.best.model, integrator=integrator)
-                label = f"{self.best.part}, {name} with {substeps} substeps"
-                trial = self.trials.attempt(label, model, self.best.raw, self.best)
-                self.tried.append(trial)
-            if chosen is None or self.trials.better(trial, chosen):
-                chosen = trial
-            elif name == "rk4":
-                settings = [s for s in settings if s[0] != "rk4"]
-        assert chosen is not None
-        self.best = chosen
 
     def settled(self) -> Model:
         """The best model, with its fitted parts as first guesses."""

@@ -45,8 +45,8 @@ class IdentifyConfig:
         5
     """
 
-    window: int = 40
-    windows: int = 300
+    window: int = 80
+    windows: int = 150
     past: int = 50
     horizons: tuple[int, ...] = (1, 5, 20)
     delay: float | Auto = AUTO

@@ -48,20 +48,25 @@ def _shifted(chooser: Chooser, direction: float) -> bool:
     return True
 
 
-def choose_again(chooser: Chooser) -> None:
+def choose_again(chooser: Chooser, promising: Trial) -> None:
     """Choose delay, lag and slew anew behind the other parts, and drop what is not needed then.
 
     A drive that pushes less to one side, of which the first choice knew nothing, looks late.
+
+    Args:
+        chooser: what tries models.
+        promising: the trial whose parts are there from the start.
     """
     before, config = chooser.best, chooser.config
+    chooser.best = promising
     delay = 0.0 if config.delay == AUTO else config.delay
     base = with_delays(chooser.settled(), delay)
     if config.delay == AUTO or config.lag == AUTO:
         chooser.best = chooser.consider(f"at once, {_others(chooser)}", base)
         chooser.choose_path()
         chooser.choose_slew()
-        if not _preferred(chooser, chooser.best, before):
-            chooser.best = before
+    if chooser.best is not before and not _preferred(chooser, chooser.best, before):
+        chooser.best = before
     for name in chooser.best.model.fitted:
         if part_of(name)[0] in NEUTRAL:
             chooser.drop(name)

@@ -14,13 +14,16 @@ _FAR = 12.0
 """Standard deviations of the noise beyond which a sample may be a spike."""
 _ROUGH = 5.0
 """How much further it must be away than curves of different order through those beside it."""
+_STEPS = 0.95
+"""Share of the changes from sample to sample than which a spike is larger."""
 _BESIDE = (-2, -1, 1, 2)
 
 
 def without_spikes(system: System, samples: Samples) -> tuple[Samples, list[Finding]]:
     """Leave out measurements that are far from a curve through the two before and the two after.
 
-    A hit or a step is no spike, for the samples after it do not go back to where those before it
+    A spike is far beyond the noise, and further than the state usually moves from one sample to the
+    next. A hit or a step is none, for the samples after it do not go back to where those before it
     point.
 
     Args:
@@ -47,15 +50,18 @@ def without_spikes(system: System, samples: Samples) -> tuple[Samples, list[Find
 def _spiky(samples: Samples, column: Tensor, level: float) -> Tensor:
     """Which measurements are spikes, bool ``[N]``."""
     found = torch.zeros(len(column), dtype=torch.bool)
-    if len(column) < 5:
+    moved = column.diff().abs()
+    moved = moved[moved.isfinite()]
+    if len(column) < 5 or not len(moved):
         return found
+    least = max(_FAR * level, float(torch.quantile(moved[:100_000], _STEPS)))
     middle = torch.arange(2, len(column) - 2)
     rows = middle[:, None] + torch.tensor(_BESIDE)
     time, value = samples.time[rows] - samples.time[middle, None], column[rows]
     cubic, line = _at_zero(time, value), _at_zero(time[:, 1:3], value[:, 1:3])
     away, rough = (column[middle] - cubic).abs(), (cubic - line).abs()
     inside = samples.stretch[middle - 2] == samples.stretch[middle + 2]
-    far = (away > _FAR * level) & (away > _ROUGH * rough)
+    far = (away > least) & (away > _ROUGH * rough)
     found[middle] = far & inside  # comparisons with NaN are false
     return found
 

@@ -79,7 +79,7 @@ def factor_of(unit: str, key: str, *, kind: str | None = None) -> float:
     """
     if unit not in UNITS:
         close = get_close_matches(unit, UNITS, n=1, cutoff=0.5)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
+        hint = f"; did you mean {close[0]!r}?" if close else "."
         raise ConfigError(
             key,
             f"unknown unit {unit!r}{hint} Expected one of {sorted(UNITS)}, or a `scale` instead.",
