@@ -177,6 +177,7 @@ def main() -> None:
         agent, path = load_agent(AGENTS / task, planner=True), RESULTS / f"{task}.json"
         found = calibrated(agent)
         found["origin"] = origin_text(describe_origin(SEED))
+        print(task, json.dumps(found), flush=True)  # playing may take long
         if not arguments.only_imagine:
             kept = kept_episodes(path, found) if arguments.keep else {}
             found["world"] = played(agent, found["changes"], kept)

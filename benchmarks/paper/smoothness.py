@@ -1,10 +1,11 @@
 """Return against smoothness of the shipped agents: their plans, plans with a price, their actors.
 
     python benchmarks/paper/smoothness.py --tasks pendulum-swingup cartpole
+    python benchmarks/paper/smoothness.py --tasks     # table and picture of what there is
 
 Plays the agents in results/agents as they are, with a price of changes in the plan (change_cost)
 and without a plan, in the same episodes of evaluation. Chatter is what ``Evaluation.chatter``
-measures. It chooses nothing. Writes results/smoothness/; tasks that were played before stay.
+measures. Beside them stands what ``calibration.py`` measured. It chooses nothing. Writes results/smoothness/; tasks that were played before stay.
 """
 
 from __future__ import annotations
@@ -51,11 +52,34 @@ def measure(agent: Agent, episodes: int) -> dict[str, Any]:
     return summary | lists
 
 
-def write(result: Mapping[str, Any], results: Path) -> None:
-    """Write what a task's controllers measured, and the table and picture of all tasks so far."""
+def calibrated(task: str, results: Path) -> dict[str, dict[str, float]]:
+    """What whoever acts after calibration measured in ``calibration.py``, if it has played."""
+    path = results.parent / "calibration" / f"{task}.json"
+    found = json.loads(path.read_text()) if path.is_file() else {}
+    if "world" not in found:
+        return {}
+    world = found["world"]["actor" if found["acting"] == "actor" else "chosen"]
+    returns = torch.tensor(world["returns"], dtype=torch.float64)
+    return {
+        "as calibrated": {
+            "return_mean": returns.mean().item(),
+            "standard_error": (returns.std() / len(returns) ** 0.5).item(),
+            "chatter": world["chatter"],
+        }
+    }
+
+
+def write(result: Mapping[str, Any] | None, results: Path) -> None:
+    """Write what a task's controllers measured, and the table and picture of all tasks so far.
+
+    Without a result it writes table and picture alone.
+    """
     results.mkdir(parents=True, exist_ok=True)
-    (results / f"{result['task']}.json").write_text(json.dumps(result, indent=1) + "\n")
+    if result is not None:
+        (results / f"{result['task']}.json").write_text(json.dumps(result, indent=1) + "\n")
     every = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
+    for each in every:
+        each["measured"] |= calibrated(each["task"], results)
     draw(every).savefig(results / "smoothness.png", dpi=110)
     rows = [
         [each["task"], name, f"{m['return_mean']:.1f}", f"{m['standard_error']:.1f}",
@@ -72,7 +96,9 @@ def write(result: Mapping[str, Any], results: Path) -> None:
         "Made by `python benchmarks/paper/smoothness.py`. Do not edit. The agents of "
         f"`results/agents/` in {', '.join(map(str, episodes))} episodes of evaluation, the same "
         "for all rows of a task. Chatter is the mean change of the action from step to step in "
-        "the second half of episodes, as a share of its half-range. Nothing is chosen here.\n\n"
+        "the second half of episodes, as a share of its half-range. Nothing is chosen here. *As "
+        "calibrated* is the agent that `results/calibration/` has chosen in imagination, in that "
+        "page's own episodes, whose first seed is the same.\n\n"
         "![Return against chatter](smoothness.png)\n\n"
         f"{markdown_table(['task', 'controller', 'return', 's.e.', 'chatter'], rows)}\n"
         f"Not run: {', '.join(missing) or 'none'}.\n\n"
@@ -82,8 +108,13 @@ def write(result: Mapping[str, Any], results: Path) -> None:
 
 def draw(every: Sequence[Mapping[str, Any]]) -> Figure:
     """A panel for each task: return against chatter, with standard errors."""
-    figure = Figure(figsize=(3.6 * len(every), 3.2), layout="constrained")
-    for axis, each in zip(figure.subplots(1, len(every), squeeze=False)[0], every, strict=True):
+    columns = min(len(every), 3)
+    rows = -(-len(every) // columns)
+    figure = Figure(figsize=(3.6 * columns, 3.2 * rows), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False).flatten()
+    for axis in axes[len(every) :]:
+        axis.set_visible(False)
+    for axis, each in zip(axes, every, strict=False):
         for name, found in each["measured"].items():
             point = (found["chatter"], found["return_mean"])
             axis.errorbar(*point, yerr=found["standard_error"], marker="o", label=name)
@@ -97,7 +128,7 @@ def draw(every: Sequence[Mapping[str, Any]]) -> Figure:
 def main(words: Sequence[str] | None = None) -> None:
     """Play the tasks that the words name."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--tasks", nargs="+", default=list(TARGETS))
+    parser.add_argument("--tasks", nargs="*", default=list(TARGETS))
     parser.add_argument("--episodes", type=int, default=EPISODES)
     parser.add_argument("--agents", type=Path, default=AGENTS)
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -120,6 +151,8 @@ def main(words: Sequence[str] | None = None) -> None:
             },
             arguments.results,
         )
+    if not arguments.tasks:
+        write(None, arguments.results)
 
 
 if __name__ == "__main__":
