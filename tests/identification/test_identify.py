@@ -123,7 +123,7 @@ def test_a_delay_is_found_with_positions_alone() -> None:
     ],
 )
 def test_the_path_of_the_command_is_found(drive: Actuator) -> None:
-    log = record(Mass(), MASS, actuator=drive, noise=(1e-3, UNSEEN), samples=2000)
+    log = record(Mass(), MASS, actuator=drive, noise=(1e-3, UNSEEN), samples=1000)
     found = identify(make_task(Mass()), [log])
     actuator = found.actuator.actuator
     assert actuator is not None

@@ -40,16 +40,12 @@ class Dry(Mass):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_delay_is_found_in_a_short_log_with_friction_that_is_not_modelled(seed: int) -> None:
-    noise = (1e-3, math.nan if seed % 2 else 1e-2)
-    log = record(Dry(), MASS, actuator=Actuator(1.0), noise=noise, samples=600, seed=seed)
+def test_a_delay_is_found_in_a_short_log_with_friction_that_is_not_modelled() -> None:
+    log = record(Dry(), MASS, actuator=Actuator(1.0), noise=(1e-3, math.nan), samples=600, seed=1)
     assert identify(make_task(Mass()), [log]).actuator.actuator == Actuator(1.0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_no_part_of_a_drive_is_chosen_where_there_is_none(seed: int) -> None:
-    noise = (0.003, math.nan) if seed % 2 else (0.01, 0.05)
-    log = record(Rod(), ROD, noise=noise, samples=1000, seed=seed)
+def test_no_part_of_a_drive_is_chosen_where_there_is_none() -> None:
+    log = record(Rod(), ROD, noise=(0.01, 0.05), samples=800)
     assert identify(make_task(Rod()), [log]).actuator.actuator is None

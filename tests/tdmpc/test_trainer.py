@@ -28,7 +28,7 @@ def make_trainer(task="pendulum", max_steps=20, world="simulated", **kwargs):
         **{
             "real_steps": 70,
             "seed_steps": 30,
-            "updates_per_step": 1.0,
+            "updates_per_step": 0.2,
             "batch_size": 4,
             "replay_capacity": 500,
             "evaluation_interval": 1000,
@@ -56,7 +56,7 @@ def finish(trainer):
 
 def test_steps_and_updates_are_counted_as_published():
     """Two random episodes, then as many updates as they had steps; then an episode, its updates."""
-    trainer = make_trainer()
+    trainer = make_trainer(updates_per_step=1.0)
     metrics = finish(trainer)
     lengths = [m["tdmpc/episode_length"] for m in metrics if "tdmpc/episode_length" in m]
     updates = [m["tdmpc/updates"] for m in metrics if "tdmpc/updates" in m]

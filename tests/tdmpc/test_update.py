@@ -69,7 +69,7 @@ def test_learning_beyond_chance_on_a_tiny_problem():
     config = TDMPCConfig(loss=TDMPCLossConfig(value_coef=1.0))
     update = TDMPCUpdate(told, config)
     generator = torch.Generator().manual_seed(0)
-    for _ in range(400):
+    for _ in range(250):
         observation, action = (2 * torch.rand(64, 1, 1, generator=generator) - 1 for _ in range(2))
         update(
             TensorDict(

@@ -21,6 +21,7 @@ CONFIG = ModelConfig(
     real_steps=60,
     steps_per_iteration=30,
     hidden_sizes=(4,),
+    integrator="semi_implicit_euler",
     fit=FitConfig(steps=1),
     collect=COLLECT,
 )
@@ -67,7 +68,7 @@ def finish(trainer: ModelTrainer) -> None:
         trainer.advance()
 
 
-@pytest.mark.parametrize("step", [2, 17, 30, 31, 47])
+@pytest.mark.parametrize("step", [2, 30, 31])
 def test_an_environment_that_fails_loses_no_step_before(step: int) -> None:
     rig = failing_at(step)
     trainer = ModelTrainer(PENDULUM, CONFIG, seed=0, world=world_of(rig))

@@ -20,7 +20,13 @@ from tests.trainers.run_parts import CONFIG
 from tests.trainers.trainer_parts import COLLECT, PENDULUM
 
 ONE = ModelConfig(
-    real_steps=240, steps_per_iteration=120, kind="prior", fit=FitConfig(steps=8), collect=COLLECT
+    real_steps=240,
+    steps_per_iteration=120,
+    kind="prior",
+    hidden_sizes=(4,),
+    integrator="semi_implicit_euler",
+    fit=FitConfig(steps=8),
+    collect=COLLECT,
 )
 TASK = replace(PENDULUM, name="late-pendulum", max_steps=40)
 

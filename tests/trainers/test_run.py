@@ -120,7 +120,7 @@ def test_from_needs_the_phases_before_of_the_same_task(whole: Path, tmp_path: Pa
 # Compiled
 
 
-@pytest.mark.usefixtures("aot_eager")
+@pytest.mark.usefixtures("traced")
 def test_no_graph_breaks_and_none_is_compiled_twice(whole: Path, tmp_path: Path) -> None:
     """A whole run; a break would fail it, for every graph is a full one."""
     torch._dynamo.utils.counters.clear()

@@ -82,7 +82,9 @@ def test_running_out_of_steps_starts_anew_and_is_no_termination() -> None:
 
 def test_a_fall_is_a_termination_and_starts_anew() -> None:
     task = get_task("cartpole")
-    rows = rows_of(trained(task, replace(REAL, real_steps=400, random_steps=400)))
+    rows = rows_of(
+        trained(task, replace(REAL, real_steps=200, random_steps=200, evaluation_interval=200))
+    )
     assert rows.terminated.any()
     assert torch.equal(rows.terminated, task.is_terminated(rows.next_state))
     goes_on = (rows.next_state[:-1] == rows.state[1:]).all(-1)
@@ -189,8 +191,8 @@ def test_truncated_data_are_no_terminations() -> None:
 def test_it_learns_to_stop_a_sled() -> None:
     """Far better than doing nothing, than random actions and than where it began."""
     config = RealTD3Config(
-        real_steps=3000,
-        random_steps=500,
+        real_steps=1500,
+        random_steps=300,
         evaluation_interval=500,
         evaluation_episodes=50,
         actor_hidden_sizes=(32,),

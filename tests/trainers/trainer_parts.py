@@ -27,6 +27,7 @@ MODEL = ModelConfig(
     real_steps=70,
     steps_per_iteration=25,
     hidden_sizes=(4,),
+    integrator="semi_implicit_euler",  # the choice of one has tests of its own, and fits five
     fit=FitConfig(steps=2, batch_size=16),
     collect=COLLECT,
 )
