@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from brief import shorten
 
 import phihp_torchrl
 import phihp_torchrl.tdmpc  # its phase and agent stay registered
@@ -30,10 +31,12 @@ TINY = {
     "model.collect.num_candidates": 8,
     "model.collect.top_k": 2,
     "model.collect.optim_steps": 1,
+    "model.collect.replan_every": 2,
     "policy.updates": 2,
     "policy.batch_size": 8,
     "policy.num_worlds": 4,
     "policy.chunk_steps": 2,
+    "policy.updates_per_step": 2,
     "policy.evaluation_interval": 2,
     "policy.evaluation_episodes": 2,
     "policy.evaluation_steps": 20,
@@ -92,7 +95,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def learn_little(*arguments, overrides=(), **options):
         lines = [*override_lines(overrides), *override_lines(TINY)]
-        return learn(*arguments, overrides=lines, **options)
+        with pytest.MonkeyPatch.context() as patch:
+            shorten(patch)
+            return learn(*arguments, overrides=lines, **options)
 
     monkeypatch.setattr(phihp_torchrl, "learn", learn_little, raising=False)
     pygame = pytest.importorskip("pygame")

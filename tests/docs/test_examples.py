@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
+from brief import shorten
 
 from phihp_torchrl import learn
 from tests.docs.blocks import BLOCKS, PAGES, SHELLS, Block, commands
@@ -23,12 +24,18 @@ WIDTH = 84
 
 
 def python_pages() -> list[Any]:
-    """Pages with Python to run, those with a slow block marked so."""
+    """Pages with Python to run, those with a slow block marked so.
+
+    What a page has from README.md alone is run there.
+    """
     pages = []
+    first = {block.text for block in BLOCKS["README.md"]}
     for page, blocks in BLOCKS.items():
         if page.startswith("docs/tutorials/"):
             continue  # which have commands between their blocks, and a test of their own
         python = [block for block in blocks if block.language == "python" and not block.title]
+        if page != "README.md" and all(block.text in first for block in python):
+            continue
         if python:
             slow = any(block.mark == "slow" for block in python)
             marks = [pytest.mark.slow, pytest.mark.timeout(900)] if slow else []
@@ -55,8 +62,9 @@ def test_python_runs_as_printed(page, place, small):
         ("my_method", {"method": "prior-cem", **PLAIN}, "evaluate/planner/return_mean"),
     ],
 )
-def test_printed_plugins_learn(module, settings, metric, place):
+def test_printed_plugins_learn(module, settings, metric, place, monkeypatch):
     """What the pages add to the package from a file of their own works in a run."""
+    shorten(monkeypatch)
     import_module(module)
     world = settings.pop("world", "simulated")
     small = {name: value for name, value in TINY.items() if name != "planner.num_kept_elites"}
