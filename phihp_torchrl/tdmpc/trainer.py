@@ -330,7 +330,7 @@ def _build(context: Context) -> Phase:
         context.settings,
         seed=config.seed,
         world=context.world,
-        compile=config.compile,
+        compile=context.compile,
     )
 
 

@@ -43,6 +43,11 @@ class Context:
     directory: RunDirectory
 
     @property
+    def compile(self) -> bool:
+        """Whether the phase is compiled, as the run has chosen."""
+        return self.config.compile is True
+
+    @property
     def parts(self) -> dict[str, Any]:
         """What the earlier phases made, as arguments of :class:`~phihp_torchrl.Agent`."""
         parts: dict[str, Any] = {}

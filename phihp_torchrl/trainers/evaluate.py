@@ -286,7 +286,7 @@ def _build(context: Context) -> Phase:
     parts = context.parts
     config, agent = context.config, parts.get("agent")
     if agent is None:
-        parts = {"planner_config": context.planner, "compile": config.compile, **parts}
+        parts = {"planner_config": context.planner, "compile": context.compile, **parts}
         agent = Agent(context.task, **parts)
     world, samples = context.world, real_steps(context.before)
     collect = getattr(config.sections.get("model"), "collect", None)

@@ -30,7 +30,7 @@ def build_policy(context: Context) -> Phase:
             world=context.world,
             seed=config.seed,
             data_states=model.states(),
-            compile=config.compile,
+            compile=context.compile,
             covariance=covariance,
         )
 

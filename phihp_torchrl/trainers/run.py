@@ -7,7 +7,7 @@ import random
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from phihp_torchrl.deployment import plain_defaults
 from phihp_torchrl.display import Progress
 from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.trainers.checkpoints import clear_rotation, load_latest, load_state
+from phihp_torchrl.trainers.compile_choice import earned
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.expected import expect
 from phihp_torchrl.trainers.files import check_contained
@@ -220,15 +221,28 @@ class _Run:
         for phase in self.phases.values():  # one may have found out more of the world's task
             known = getattr(phase, "world", None)
             world = known if isinstance(known, World) else world
+        settings = resolve_seconds(self.config.section(name), world.task.time_step)
         context = Context(
-            config=self.config,
-            settings=resolve_seconds(self.config.section(name), world.task.time_step),
+            config=replace(self.config, compile=self._compiles(name, settings, world)),
+            settings=settings,
             task=world.task,
             world=world,
             before=dict(self.phases),
             directory=self.directory,
         )
         return PHASES[name].build(context)
+
+    def _compiles(self, name: str, settings: Any, world: World) -> bool:
+        """Whether a phase is compiled; what was chosen once is kept, and said."""
+        if isinstance(self.config.compile, bool):
+            return self.config.compile
+        chosen = self.record.metadata.setdefault("compiled", {})
+        if name not in chosen:
+            found = earned(self.config, name, settings, world)
+            chosen[name] = found.pays
+            if found.taken and name in self.config.phases_to_do:
+                self.progress.say(found.words(name))
+        return bool(chosen[name])
 
     def _advance(self, name: str, phase: Phase, table: MetricsTable, logger: RunLogger) -> bool:
         """Work through a phase; false if a signal ended it early."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 from phihp_torchrl.config import (
     ConfigError,
@@ -52,7 +52,7 @@ class RunConfig:
             before is used.
         threads: intra-op threads of torch; more than one is slower on these small networks.
         compile: whether to compile TD3, imagination and the agent's plans (minutes the first time,
-            seconds later).
+            seconds later); auto for a phase that is long enough to earn it.
         progress: whether to say at least every ten seconds where the run is.
         actuator: numbers of the task's actuator that differ, by name: delay_steps, lag, slew,
             dead_zone, gain_low.
@@ -90,7 +90,7 @@ class RunConfig:
     checkpoint_interval: float = 60.0
     keep_checkpoints: int = 2
     threads: int = 1
-    compile: bool = True
+    compile: bool | Literal["auto"] = "auto"
     progress: bool = True
     actuator: Mapping[str, Any] = field(default_factory=dict, hash=False)
     action_rate_limit: float | tuple[float, ...] | None = None

@@ -262,7 +262,7 @@ def _build(context: Context) -> Phase:
         seed=config.seed,
         world=context.world,
         transitions=None if model is None else model.transitions(),
-        compile=config.compile,
+        compile=context.compile,
     )
 
 
