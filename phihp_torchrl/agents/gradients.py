@@ -15,8 +15,8 @@ def grad_and_value(
     """Compute the gradients of ``loss(layers, *args)`` with respect to the layers, and its value.
 
     A compiler takes :func:`torch.func.grad_and_value` as a part of its graph. Eagerly that function
-    wraps each tensor at each operation, and about half of the time of an update goes there; the tape
-    of :mod:`torch.autograd` finds the same gradients to the last bit.
+    wraps each tensor at each operation, and about half of the time of an update goes there; the
+    tape of :mod:`torch.autograd` finds the same gradients to the last bit.
 
     Args:
         loss: a function of the layers and of ``args``, whose result has no dimension.
