@@ -237,7 +237,7 @@ def test_entropy_keeps_the_actor_from_its_ends():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("aot_eager")
+@pytest.mark.usefixtures("traced")
 def test_compiled_it_is_the_same():
     short = replace(CONFIG, horizon=2, critic_updates=2)
     plain, fast = (make_update(config=short, compile=c) for c in (False, True))

@@ -19,6 +19,7 @@ NOISE = {"theta": 0.01, "theta_dot": 0.05}
 MODEL = ModelConfig(
     real_steps=300,
     steps_per_iteration=300,
+    hidden_sizes=(8,),
     integrator="semi_implicit_euler",
     fit=FitConfig(steps=10),
     collect=CollectConfig(
@@ -122,7 +123,7 @@ def test_noise_in_one_step_errors_is_told(caplog):
 def test_a_run_with_noisy_sensors_predicts_to_the_noise():
     world = SimulatedWorld(TASK, SimulatedConfig(noise=NOISE))
     fitting = FitConfig(method="multiple_shooting")
-    config = replace(MODEL, real_steps=1000, steps_per_iteration=1000, fit=fitting)
+    config = replace(MODEL, real_steps=600, steps_per_iteration=600, fit=fitting)
     torch.manual_seed(0)
     trainer = ModelTrainer(TASK, config, seed=0, world=world)
     trainer.advance()

@@ -93,7 +93,7 @@ def test_keys_can_be_set():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("aot_eager")
+@pytest.mark.usefixtures("traced")
 def test_compiled_and_eager_losses_agree():
     results = []
     for compile in (False, True):
