@@ -190,8 +190,8 @@ def test_a_composition_that_is_kept_is_no_other_ones() -> None:
     changed["planner"]["alpha"] = changed["policy"] = None
     assert load_config("pendulum") == before
     composed = compose_yaml(["task=pendulum"])
-    composed.policy.updates = 9
-    assert compose_yaml(["task=pendulum"]).policy.updates == before["policy"]["updates"]
+    updates, composed.policy.updates = composed.policy.updates, 9
+    assert compose_yaml(["task=pendulum"]).policy.updates == updates
     for number in (1, 2):
         offer("task", "kept-task", {"task": "kept-task", "seed": number})
         assert load_config("kept-task")["seed"] == number

@@ -30,8 +30,7 @@ LINES = 60
 SMALLER = {
     "train": TINY,
     "identify": {"identify.windows": 12, "identify.lag": 0, "identify.slew": 0,
-                 "identify.dead_zone": 0, "identify.gain_low": 1, "identify.largest_delay": 2,
-                 "identify.integrator": "rk4", "identify.substeps": 2},
+                 "identify.dead_zone": 0, "identify.gain_low": 1, "identify.largest_delay": 2},
     "evaluate": {"episodes": 1, "latency_actions": 0, "video": False},
 }  # fmt: skip
 """What makes a printed command short; it goes over what the page says."""
