@@ -4,6 +4,7 @@ SHELL := /bin/sh
 
 PYTHON ?= python3
 ARGS ?=
+LOCKED ?=
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
@@ -14,13 +15,14 @@ DOCS_STAMP := $(VENV)/.installed-docs
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 HEADLESS := SDL_VIDEODRIVER=dummy MPLBACKEND=Agg WANDB_MODE=disabled
 
-.PHONY: help demo test lint format types config docs bench clean
+.PHONY: help demo test lint format types config docs bench lock clean
 
 help: ## print these targets
 	@grep -hE '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
 	@echo
 	@echo '  PYTHON=python3.12  the interpreter for .venv (>= 3.11)'
 	@echo '  ARGS="..."         more arguments for demo, test, bench'
+	@echo '  LOCKED=1           install the archives of requirements.lock alone, by their digests'
 
 demo: $(STAMP) ## learn PendulumSwingup and watch it swing up
 	$(ONE_THREAD) $(BIN)/python recipes/demo.py $(ARGS)
@@ -49,6 +51,9 @@ docs: $(DOCS_STAMP) ## build the documentation into site/
 bench: $(STAMP) ## time the hot paths (benchmarks/speed/)
 	$(ONE_THREAD) $(HEADLESS) $(BIN)/python -m pytest benchmarks/speed --benchmark-only $(ARGS)
 
+lock: $(STAMP) ## write requirements.lock and sbom.json for this platform (asks the package index)
+	$(BIN)/python .ci/lock.py
+
 clean: ## remove .venv, caches and build products (results/ and outputs/ stay)
 	rm -rf $(VENV) build dist site *.egg-info
 	rm -rf .pytest_cache .ruff_cache .mypy_cache .hypothesis .benchmarks
@@ -73,8 +78,14 @@ $(STAMP): pyproject.toml constraints.txt
 	      "install its venv module (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }; \
 	}
 	@echo "Installing phihp_torchrl and what it needs into $(VENV) (a few minutes the first time)"
+ifeq ($(LOCKED),)
 	@$(PIP) torch
 	@$(PIP) -e ".[dev]"
+else
+	@$(BIN)/python .ci/lock.py --fits
+	@$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .
+endif
 	@touch $@
 
 $(DOCS_STAMP): $(STAMP)

@@ -19,6 +19,11 @@ def write_part(name: str, record: Mapping[str, Any]) -> None:
     content = {**record, "origin": describe_origin(seed=0)}
     path = RESULTS / f"{name}.json"
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_page()
+
+
+def write_page() -> None:
+    """Write the page with all parts that there are."""
     parts = []
     for part, write in PARTS.items():
         place = RESULTS / f"{part}.json"

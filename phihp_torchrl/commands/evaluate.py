@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from phihp_torchrl.commands.words import run_command
-from phihp_torchrl.config import ConfigError, check_choice, check_count, check_fields
+from phihp_torchrl.config import ConfigError, check_choice, check_count, check_fields, check_memory
 
 if TYPE_CHECKING:
     from phihp_torchrl.deployment import Agent
@@ -60,6 +60,8 @@ class PlayConfig:
         check_choice(self, "planner", (True, False, "both"))
         check_count(self, "episodes", "threads")
         check_count(self, "seed", "latency_actions", least=0)
+        check_memory(self, "episodes")
+        check_memory(self, "latency_actions", each=2)  # times of float64
 
 
 def main(words: Sequence[str]) -> None:

@@ -54,7 +54,7 @@ def read_lines(words: Sequence[str]) -> dict[str, Override]:
         from phihp_torchrl.trainers import import_plugins
 
         plugins: Any = lines["plugins"].value()
-        import_plugins([plugins] if isinstance(plugins, str) else list(plugins or ()))
+        import_plugins([plugins] if isinstance(plugins, str) else plugins or ())
     return lines
 
 

@@ -50,11 +50,14 @@ class Registry(Mapping[str, T]):
         Raises:
             ConfigError: if there is none; the message lists the registered names.
         """
-        if name not in self._entries:
+        if name not in self:
             close = get_close_matches(str(name), self._entries, n=1)
             hint = f"; did you mean {close[0]!r}?" if close else "."
             raise ConfigError(self.what, f"expected one of {sorted(self)}, got {name!r}{hint}")
         return self._entries[name]
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and name in self._entries  # a list is no name either
 
     def __getitem__(self, name: str) -> T:
         return self._entries[name]

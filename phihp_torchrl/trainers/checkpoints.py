@@ -6,6 +6,7 @@ import json
 import logging
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -206,8 +207,14 @@ def rotation_paths(rotation: CheckpointRotation) -> list[Path]:
 
 
 def clear_rotation(rotation: CheckpointRotation) -> None:
-    """Remove a rotation's checkpoints, and files of interrupted saves."""
-    for path in [*rotation_paths(rotation), *rotation.directory.glob(f".{rotation.prefix}-*")]:
+    """Remove a rotation's checkpoints, and files of interrupted saves and removals.
+
+    Whenever it is killed, a checkpoint is whole or has a name by which none is looked for.
+    """
+    for path in rotation_paths(rotation):
+        with suppress(OSError):
+            path.rename(path.with_name(f".{path.name}-removed"))
+    for path in rotation.directory.glob(f".{rotation.prefix}-*"):
         shutil.rmtree(path, ignore_errors=True)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from phihp_torchrl.baselines import check_names
-from phihp_torchrl.config import check_count, check_fields, digest_of
+from phihp_torchrl.config import check_count, check_fields, check_memory, digest_of
 from phihp_torchrl.deployment import Agent, AgentError, load_agent, save_agent
 from phihp_torchrl.evaluation import (
     BASELINES_KEY,
@@ -67,6 +67,8 @@ class EvaluateConfig:
         check_count(self, "episodes")
         check_count(self, "first_seed", least=EVALUATION_SEED)
         check_count(self, "latency_actions", least=0)
+        check_memory(self, "episodes")
+        check_memory(self, "latency_actions", each=2)  # times of float64
         check_names(self.baselines)
 
 

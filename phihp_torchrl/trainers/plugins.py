@@ -18,6 +18,8 @@ def import_plugins(plugins: Sequence[str]) -> None:
     Raises:
         ConfigError: for a plugin that is absent or whose import fails; the message names it.
     """
+    if not isinstance(plugins, Sequence) or isinstance(plugins, str):
+        raise ConfigError("plugins", f"expected a list of files or modules, got {plugins!r}.")
     for name in plugins:
         if not isinstance(name, str):
             raise ConfigError("plugins", f"expected files or modules, got {name!r}.")

@@ -54,3 +54,12 @@ def test_a_name_is_taken_until_it_is_replaced():
     registry.register("a", 3, replace=True)
     assert dict(registry) == {"a": 3, "b": 2}
     assert list(registry) == ["a", "b"]
+
+
+@pytest.mark.parametrize("name", [[0], {"x": 1.0}, None, 3, float("nan")])
+def test_what_is_no_text_names_nothing(name):
+    registry = Registry("hue")
+    registry.register("r", 1)
+    assert name not in registry
+    with pytest.raises(ConfigError, match=r"^hue: expected one of \['r'\], got "):
+        registry.find(name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,14 @@ import pytest
 import torch
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 
-from phihp_torchrl.trainers.checkpoints import load_latest, load_state, save_state
+from phihp_torchrl.trainers.checkpoints import (
+    clear_rotation,
+    load_latest,
+    load_state,
+    save_state,
+)
 
-from .run_parts import assert_equal
+from .run_parts import Crash, assert_equal
 
 META = {"task": "pendulum"}
 
@@ -90,3 +96,23 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_used(
     corruptions()[name](rotation.checkpoints()[-1])
     with pytest.raises(CheckpointError, match="000000000001"):
         load_latest(rotation, metadata=META)
+
+
+def test_a_removal_that_is_cut_off_leaves_whole_checkpoints_or_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rotation = CheckpointRotation(tmp_path, keep_last=2, prefix="unit")
+    for unit in (1, 2):
+        save_state(rotation, {"unit": unit}, metadata=META, step=unit)
+
+    def cut_off(path: Path, **_: Any) -> None:
+        next(p for p in Path(path).rglob("*.json")).unlink()
+        raise Crash
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", cut_off)
+        with pytest.raises(Crash):
+            clear_rotation(rotation)
+    assert load_latest(rotation, metadata=META) is None
+    clear_rotation(rotation)
+    assert not list(tmp_path.iterdir())

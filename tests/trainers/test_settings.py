@@ -39,6 +39,8 @@ from .trainer_parts import REAL
         (ModelConfig, "substeps", 0),
         (EvaluateConfig, "episodes", 0),
         (EvaluateConfig, "latency_actions", -1),
+        (EvaluateConfig, "latency_actions", 10**18),
+        (EvaluateConfig, "episodes", 10**18),
         (CollectConfig, "noise", -0.1),
         (CollectConfig, "noise", math.nan),
         (CollectConfig, "random_hold", 0),
@@ -152,3 +154,18 @@ def test_the_method_goes_over_the_task_where_it_says_something() -> None:
     ours = read_run_config(load_config("acrobot", method="ph-cem", overrides=["planner.top_k=7"]))
     assert (ours.planner.top_k, ours.planner.num_candidates) == (7, 700)
     assert ours.section("model").hidden_sizes == (16, 16, 16)  # the task's, left alone
+
+
+@pytest.mark.parametrize("value", [-1, 3.5, math.inf, "mine.py", {"x": 1.0}])
+def test_plugins_are_a_list(value):
+    with pytest.raises(ConfigError, match=r"^plugins: expected a list of files or modules"):
+        read_run_config({**load_config("pendulum"), "plugins": value})
+
+
+@pytest.mark.parametrize("key", ["method", "planner.kind", "world.kind"])
+def test_a_kind_is_a_text(key):
+    settings = load_config("pendulum")
+    section, _, name = key.rpartition(".")
+    (settings[section] if section else settings)[name] = [math.nan]
+    with pytest.raises(ConfigError, match=rf"^{key}: expected one of .*, got \[nan\]"):
+        read_run_config(settings)
