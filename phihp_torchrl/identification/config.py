@@ -20,7 +20,7 @@ class IdentifyConfig:
     took no part in that trial.
 
     Args:
-        window: samples in a fitted window, whose start is free.
+        window: samples in a fitted window, whose start is free; fewer in short recordings.
         windows: windows that are fitted at most, spread over the recordings.
         past: samples before a prediction, from which its start is estimated; where stretches are
             short, half of them has to do.

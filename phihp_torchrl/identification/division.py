@@ -18,6 +18,8 @@ LEAST = 8
 """Samples that a fitted window has at least."""
 TRIAL = 25
 """Samples of a window in a trial."""
+_FEW, _SHORT = 4, 20
+"""Windows below which they are halved, as long as halves have so many samples."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,7 @@ class Division:
         short: the same samples in shorter windows, for trials.
         past: samples that a prediction has before it at least.
         horizons: steps ahead that the held-out spans are long enough for.
+        window: samples in a fitted window at most, fewer than asked for where recordings are short.
     """
 
     stops: Stops
@@ -43,6 +46,7 @@ class Division:
     short: list[Span]
     past: int
     horizons: list[int]
+    window: int
 
 
 def divide(system: System, samples: Samples, stops: Stops, config: IdentifyConfig) -> Division:
@@ -62,14 +66,18 @@ def divide(system: System, samples: Samples, stops: Stops, config: IdentifyConfi
         if able and not held:
             past, horizons = least, able
             kept, held = hold_out(samples, inside, 2 * able[-1] + 10, least, able[-1])
-    spans = cut(kept, config.window, LEAST)
+    window = config.window
+    spans = cut(kept, window, LEAST)
+    while len(spans) < _FEW and window >= 2 * _SHORT:
+        window //= 2
+        spans = cut(kept, window, LEAST)
     if len(spans) < 2:
         raise ConfigError(
             "recordings",
             f"expected at least two windows of {LEAST} samples away from stops, got {len(spans)}.",
         )
     short = cut(kept, min(TRIAL, config.window), LEAST)
-    return Division(stops, stopped, inside, held, spans, short, past, horizons)
+    return Division(stops, stopped, inside, held, spans, short, past, horizons, window)
 
 
 def spread(spans: Sequence[Span], most: int) -> list[Span]:

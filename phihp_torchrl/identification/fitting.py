@@ -93,7 +93,7 @@ def fit_recordings(task: Task, samples: Samples, config: IdentifyConfig) -> Fitt
     judged = _fit_all(model, samples, division.spans, config, chooser.best.raw, sigma)
     final = judged
     if division.held:
-        spans = cut(division.inside, config.window, LEAST)
+        spans = cut(division.inside, division.window, LEAST)
         final = _fit_all(model, samples, spans, config, judged.fit.raw, judged.fit.sigma)
     limits = {name: pair for name, pair in division.stops.items() if name in system.velocity_of}
     layout = system.layout(task.velocity_limits, limits, task.restitution)

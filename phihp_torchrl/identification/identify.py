@@ -165,7 +165,7 @@ def _settings(config: IdentifyConfig, fitted: Fitted) -> dict[str, Any]:
     return {
         "integrator": integrator.name,
         **integrator.settings,
-        "window": config.window,
+        "window": division.window,
         "starts_of_predictions": f"fitted to the {division.past} to {config.past} samples before, "
         "as many as there are",
     }

@@ -143,9 +143,10 @@ class Lateness:
             self._told = True
             _log.warning(
                 "The commands before explain errors of the model, but no dead time or lag of up "
-                "to 5 steps does. A limit of the rate, a dead zone or backlash may: if the drive "
-                "has one, say it (actuator.slew=..., actuator.dead_zone=...), or let `phihp "
-                "identify` look for it."
+                "to 5 steps does, the same for every action. A limit of the rate, a dead zone, "
+                "backlash, or actions that are late by different times may: say it "
+                "(actuator.slew=..., actuator.dead_zone=..., actuator.delay_steps=[0,2]), or let "
+                "`phihp identify` look for it, action by action."
             )
 
 
