@@ -5,7 +5,8 @@
 
 Plays the agents in results/agents as they are, with a price of changes in the plan (change_cost)
 and without a plan, in the same episodes of evaluation. Chatter is what ``Evaluation.chatter``
-measures. Beside them stands what ``calibration.py`` measured. It chooses nothing. Writes results/smoothness/; tasks that were played before stay.
+measures. Beside them stands what ``calibration.py`` measured. It chooses nothing. Writes
+results/smoothness/; tasks that were played before stay.
 """
 
 from __future__ import annotations
