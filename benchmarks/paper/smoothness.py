@@ -62,7 +62,7 @@ def calibrated(task: str, results: Path) -> dict[str, dict[str, float]]:
     world = found["world"]["actor" if found["acting"] == "actor" else "chosen"]
     returns = torch.tensor(world["returns"], dtype=torch.float64)
     return {
-        "as calibrated": {
+        f"as calibrated, {len(returns)} episodes": {
             "return_mean": returns.mean().item(),
             "standard_error": (returns.std() / len(returns) ** 0.5).item(),
             "chatter": world["chatter"],

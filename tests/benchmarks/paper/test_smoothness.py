@@ -57,7 +57,7 @@ def test_what_calibration_chose_stands_beside_what_was_played(tmp_path):
     result = {"task": "cartpole", "episodes": 2, "measured": {"actor": played}}
     smoothness.write(result | {"origin": smoothness.describe_origin(0)}, tmp_path / "out")
     text = (tmp_path / "out" / "README.md").read_text()
-    assert "| cartpole | as calibrated | 3.0 | 1.0 | 0.100 |" in text
+    assert "| cartpole | as calibrated, 2 episodes | 3.0 | 1.0 | 0.100 |" in text
     (tmp_path / "out" / "README.md").unlink()
     smoothness.main(["--tasks", "--results", str(tmp_path / "out")])
     assert (tmp_path / "out" / "README.md").read_text() == text
