@@ -3,8 +3,7 @@
     python recipes/demo.py            # or: make demo
 
 It learns as ``phihp train`` does with the default preset, nothing prepared beforehand, and puts
-page and pictures into ``outputs/demo``. Only the planner's calibration is left out, to be quick.
-Words are settings: ``python recipes/demo.py seed=1``.
+page and pictures into ``outputs/demo``. Words are settings: ``python recipes/demo.py seed=1``.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ def main(words: list[str]) -> None:
     """Learn PendulumSwingup and show it."""
     try:
         with loading(FIRST):
-            other = any(word.startswith("method=") for word in words)  # which may not have it
-            learn([f"task={TASK}", *([] if other else ["calibrate.enabled=false"]), *words])
+            learn([f"task={TASK}", *words])
     except KeyboardInterrupt:
         sys.exit(130)
 

@@ -149,6 +149,8 @@ def write(results: dict[str, dict[str, Any]], not_run: Iterable[str]) -> None:
             f"{EVALUATION_SEED:,}, to report only. Calibrated is whoever acts by the choice.\n\n"
             f"{markdown_table(second, real)}"
         )
+    unplayed = ", ".join(task for task, found in results.items() if "world" not in found)
+    text += f"\nNot played in the simulated world: {unplayed}.\n" if unplayed else ""
     text += f"\nNot run: {left}.\n" if left else ""
     RESULTS.mkdir(parents=True, exist_ok=True)
     (RESULTS / "README.md").write_text(f"{text}\nMade at: {origins}.\n")

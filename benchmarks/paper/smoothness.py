@@ -5,7 +5,8 @@
 
 Plays the agents in results/agents as they are, with a price of changes in the plan (change_cost)
 and without a plan, in the same episodes of evaluation. Chatter is what ``Evaluation.chatter``
-measures. Beside them stands what ``calibration.py`` measured. It chooses nothing. Writes results/smoothness/; tasks that were played before stay.
+measures. Beside them stands what ``calibration.py`` measured. It chooses nothing. Writes
+results/smoothness/; tasks that were played before stay.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def calibrated(task: str, results: Path) -> dict[str, dict[str, float]]:
     world = found["world"]["actor" if found["acting"] == "actor" else "chosen"]
     returns = torch.tensor(world["returns"], dtype=torch.float64)
     return {
-        "as calibrated": {
+        f"as calibrated, {len(returns)} episodes": {
             "return_mean": returns.mean().item(),
             "standard_error": (returns.std() / len(returns) ** 0.5).item(),
             "chatter": world["chatter"],

@@ -43,7 +43,7 @@ class CalibrateConfig:
         phihp_torchrl.config.ConfigError: rounds: expected rising whole numbers >= 2, got (20, 10).
     """
 
-    enabled: bool = True
+    enabled: bool = False
     episodes: int = 6
     rounds: tuple[int, ...] = (10, 30)
     follow_steps: int = 50

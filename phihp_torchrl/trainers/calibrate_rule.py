@@ -12,6 +12,8 @@ from torch import Tensor
 
 # Of the plan's gain over the actor, what smoothness may cost.
 _SHARE = 0.1
+# And of the actor's return, if that is more: it is less than anybody would notice.
+_TRIFLE = 1e-3
 # Chatter of the smoother plan, as a share of the other's; and the least difference of the two.
 _SMOOTHER, _NOTICEABLE = 2 / 3, 0.01
 
@@ -83,7 +85,7 @@ def choose(
 
     - earns more, by over ``confidence`` standard errors of the paired differences, or
     - is clearly smoother, with at most two thirds of the chatter, and does not earn less by more
-      than a tenth of the given plan's gain over the actor.
+      than a tenth of the given plan's gain over the actor, or a thousandth of the actor's return.
 
     The plan that is chosen acts if its mean gain over the actor is above one standard error, or if
     it earns no less and is clearly smoother. Above ``confidence`` standard errors this is certain;
@@ -113,7 +115,8 @@ def choose(
     plan, reason = given, "as given"
     if other is not None:
         ahead, error = other.ahead_of(given)
-        allowed = _SHARE * max(given.ahead_of(actor)[0], 0.0)
+        trifle = _TRIFLE * abs(sum(actor.returns) / len(actor.returns))
+        allowed = max(_SHARE * given.ahead_of(actor)[0], trifle)
         if ahead > confidence * error or (given.fails and not other.fails):
             plan, reason = other, "better"
         elif ahead >= -allowed and other.smoother_than(given):

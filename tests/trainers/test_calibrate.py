@@ -10,11 +10,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, load_config, save_agent
+from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, save_agent
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
-from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, read_run_config, run
+from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, run
 from phihp_torchrl.trainers.calibrate_budget import final_steps
 from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
 
@@ -213,7 +213,6 @@ def test_the_file_says_how_the_agent_acts(tmp_path, acting):
 
 @pytest.mark.slow
 def test_a_run_calibrates_before_it_evaluates(tmp_path):
-    assert read_run_config(load_config("pendulum")).section("calibrate").enabled
     config = with_sections(CONFIG, calibrate=TINY)
     result = run(config, tmp_path / "run")
     table = json.loads((tmp_path / "run" / "calibration.json").read_text())

@@ -62,6 +62,13 @@ def test_smoothness_may_cost_a_tenth_of_the_gain() -> None:
     assert chosen(7.8, 9.7, 7.7, 9.8, chatter=0.0) == "as given"
 
 
+def test_smoothness_may_cost_a_thousandth_of_the_return() -> None:
+    given, actor = way(1000.0, 1000.0, 1000.0), way(1000.0, 1001.0, 999.0, chatter=0.0)
+    for loss, reason in ((0.9, "smoother"), (1.1, "as given")):
+        calm = way(*(1000.0 - loss,) * 3, chatter=0.1, changes=OTHER)
+        assert choose(given, calm, actor).reason == reason
+
+
 def test_where_the_plan_gains_nothing_smoothness_must_be_free() -> None:
     given, actor = way(-1.0, 1.0, -1.0, 1.0), ACTOR
     worse = way(-1.1, 1.0, -1.0, 1.05, chatter=0.0, changes=OTHER)

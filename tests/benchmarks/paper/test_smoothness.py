@@ -43,3 +43,21 @@ def test_it_writes_what_was_played_and_names_what_was_not(tmp_path):
         assert f"| cartpole | {name} | {mean:.1f} |" in text
     assert "Not run: pendulum, pendulum-swingup, cartpole-swingup, acrobot" in text
     assert (tmp_path / "out" / "smoothness.png").stat().st_size > 1000
+
+
+def test_what_calibration_chose_stands_beside_what_was_played(tmp_path):
+    """Whoever acts: here the actor, with a mean of 3 and a standard error of 1."""
+    assert smoothness.calibrated("cartpole", tmp_path / "out") == {}
+    world = {"chosen": {"returns": [9.0, 9.0], "chatter": 0.5}}
+    world["actor"] = {"returns": [2.0, 4.0], "chatter": 0.1}
+    (tmp_path / "calibration").mkdir()
+    found = {"acting": "actor", "world": world}
+    (tmp_path / "calibration" / "cartpole.json").write_text(json.dumps(found))
+    played = {"return_mean": 5.0, "standard_error": 0.5, "chatter": 0.9}
+    result = {"task": "cartpole", "episodes": 2, "measured": {"actor": played}}
+    smoothness.write(result | {"origin": smoothness.describe_origin(0)}, tmp_path / "out")
+    text = (tmp_path / "out" / "README.md").read_text()
+    assert "| cartpole | as calibrated, 2 episodes | 3.0 | 1.0 | 0.100 |" in text
+    (tmp_path / "out" / "README.md").unlink()
+    smoothness.main(["--tasks", "--results", str(tmp_path / "out")])
+    assert (tmp_path / "out" / "README.md").read_text() == text
