@@ -104,7 +104,9 @@ def loosened_system(system: System, states: Tensor, time: Tensor) -> System:
 
     class Loose(base):
         def prior(self, state: Tensor, action: Tensor, constants: Mapping[str, Any]) -> Tensor:
-            ahead: Tensor = super().prior(state, action, constants)
+            # A prior may go through its constants in turn, so it sees none but its own.
+            ours = {name: constants[name] for name in system.ranges}
+            ahead: Tensor = super().prior(state, action, ours)
             return ahead + added(state, constants)
 
     loose: System = copy.copy(system)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
 from phihp_torchrl.identification import Identification, IdentifyConfig, identify
+from phihp_torchrl.identification.completeness import loosened_system
 from phihp_torchrl.identification.parts import IDENTIFIED, IF_COMPLETE
 from tests.identification.rigs import MASS, Mass, Undamped, make_task, record
 from tests.identification.test_identify import PLAIN, UNSEEN, codes
@@ -36,6 +38,22 @@ def test_constants_that_friction_moves_hold_for_complete_equations_alone(forgott
 def test_they_are_first_guesses_that_training_may_move(forgotten):
     task = forgotten.task(make_task(Undamped()), fixed=True)
     assert not task.system.ranges["gain"].fixed
+
+
+def test_a_prior_may_take_its_constants_in_turn():
+    class InTurn(Mass):
+        def prior(self, state, action, constants):
+            gain, stiffness, damping = constants.values()
+            return super().prior(
+                state, action, {"gain": gain, "stiffness": stiffness, "damping": damping}
+            )
+
+    states, action = torch.rand(2, 5, 2), torch.rand(3, 1)
+    loose = loosened_system(InTurn(), states, torch.arange(5.0).expand(2, 5))
+    constants = {name: torch.tensor(c.guess) for name, c in loose.ranges.items()}
+    found = loose.prior(states[0, :3], action, constants)
+    own = {name: constants[name] for name in Mass().ranges}
+    torch.testing.assert_close(found, Mass().prior(states[0, :3], action, own))  # added ones are 0
 
 
 def test_friction_is_not_taken_for_a_late_command(forgotten):
