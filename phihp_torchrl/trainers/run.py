@@ -329,16 +329,19 @@ class _Run:
         found = load_latest(self.directory.rotation, metadata=self.origin)
         # A checkpoint of an earlier phase was outlived by that phase's final state.
         if found is not None and found[1].get("phase") == name:
-            self._restore(phase, found[1], ours=True)
+            # Random states also where it was done but not yet finished: it is saved once more.
+            self._restore(phase, found[1], ours=True, random_states=True)
 
-    def _restore(self, phase: Phase, state: Mapping[str, Any], *, ours: bool) -> None:
-        """Continue from a state, of this run or (``ours`` false) of the one it begins from."""
+    def _restore(
+        self, phase: Phase, state: Mapping[str, Any], *, ours: bool, random_states: bool = False
+    ) -> None:
+        """Take over a state, of this run or (``ours`` false) of the one it begins from."""
         if ours:
             self.record.load_state_dict(state)
         try:
             phase.load_state_dict(state["trainer"])
             self.position = _Position(**state["position"])
-            if not phase.done:
+            if random_states:
                 GlobalRNGState().load_state_dict(state["random"])
         except Exception as error:  # a hostile state may fail in any way
             raise CheckpointError(

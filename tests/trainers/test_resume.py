@@ -22,7 +22,7 @@ from .run_parts import CONFIG, UNITS, Crash, assert_same_run, rows, run_module
 KILLS = {
     "model: after its row, before its checkpoint": (1, "_log_unit"),
     "policy: after its row, before its checkpoint": (4, "_log_unit"),
-    "evaluate: after a checkpoint": (6, "_save"),
+    "evaluate: after its last checkpoint, before it is finished": (UNITS, "_save"),
 }
 """The unit at which a run is killed, and the method of a run after which."""
 
