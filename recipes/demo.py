@@ -2,8 +2,9 @@
 
     python recipes/demo.py            # or: make demo
 
-It learns as ``phihp train`` does with the default preset, nothing prepared beforehand, and puts
-page and pictures into ``outputs/demo``. Words are settings: ``python recipes/demo.py seed=1``.
+It learns as ``phihp train`` does with the default preset, nothing prepared beforehand, plays 20
+episodes that it has not met, and puts page and pictures into ``outputs/demo``. Words are settings:
+``python recipes/demo.py seed=1``.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from phihp_torchrl.commands import use_utf8
 from phihp_torchrl.display import loading
 
 TASK = "pendulum-swingup"
+FEWER = ("evaluate.episodes=20",)
 OUTPUT = Path("outputs/demo")
 FIRST = (
     f"{TASK}: from nothing, it takes real steps, fits a model to them, learns a policy in the "
@@ -27,7 +29,7 @@ def main(words: list[str]) -> None:
     """Learn PendulumSwingup and show it."""
     try:
         with loading(FIRST):
-            learn([f"task={TASK}", *words])
+            learn([f"task={TASK}", *FEWER, *words])
     except KeyboardInterrupt:
         sys.exit(130)
 

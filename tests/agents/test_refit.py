@@ -130,7 +130,7 @@ def test_returns_that_are_not_finite_teach_nothing():
     assert all(layer.isfinite().all() for layer in result.critics)
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("traced")  # its gradient is that of test_td3, which is compiled there
 def test_compiled_equals_eager():
     short = replace(SMALL, horizon=2)
     refit, update, model = make(config=short)
