@@ -33,7 +33,9 @@ def describe_origin(seed: int) -> dict[str, Any]:
     """
     versions = {"python": platform.python_version()}
     versions |= {package: package_version(package) for package in _PACKAGES}
-    status = _git("status", "--porcelain", "--untracked-files=no")
+    # A script that writes its results as it goes changes them, but not the code that makes them.
+    places = (":(top)", ":(top,exclude)results")
+    status = _git("status", "--porcelain", "--untracked-files=no", "--", *places)
     return {
         "seed": seed,
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
