@@ -45,8 +45,8 @@ class TD3Config:
     """Hyper-parameters of TD3 (paper, section 4.2; ``preset=paper`` has the published values).
 
     Args:
-        actor_hidden_sizes: widths of the actor's hidden layers.
-        critic_hidden_sizes: widths of each critic's hidden layers.
+        actor_hidden_sizes: widths of the actor's hidden layers (paper: 2 x 300).
+        critic_hidden_sizes: widths of each critic's hidden layers (paper: 3 x 200).
         actor_learning_rate: learning rate of the actor.
         critic_learning_rate: learning rate of the critics.
         last_layer_scale: factor on the initial weights of the actor's last layer.

@@ -115,7 +115,7 @@ def _bounces(column: Tensor, samples: Samples, level: float) -> int:
         return 0
     top = float(column[column.isfinite()].max())
     reach = float(torch.quantile(moved[:100_000], 0.99))
-    near = (column[1:-1] > top - reach).nan_to_num()
+    near = column[1:-1] > top - reach
     usual = bend[~near].abs()
     if not len(usual):
         return 0
