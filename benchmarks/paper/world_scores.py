@@ -120,7 +120,7 @@ Made by `python benchmarks/paper/worlds.py`. Do not edit. Default settings throu
 the textbook's equations with guesses 30 % off, stops and their kind, the simulator's integrator, a
 reward, and at most how many steps to take (`benchmarks/paper/other_worlds`). Nothing else is set by
 hand for a task. Actions of dm_control's tasks are held for two steps, and each of those counts as a
-step of the environment. Our returns are means of 10 episodes in the world itself, from seeds that
+step of the environment. Our returns are means of 20 episodes in the world itself, from seeds that
 no training uses.
 
 Scores of others on the same tasks, with the same action repeat, are those of TD-MPC2's public

@@ -30,7 +30,7 @@ from phihp_torchrl.worlds import GivenConfig
 from world_scores import write_report
 
 RESULTS, RUNS = Path("results/worlds"), Path("outputs/worlds")
-EPISODES = 10
+EPISODES = 20
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ ENTRIES = {
     "pendulum-swingup": Entry("dm_control pendulum", 2000, 800.0),
     "cartpole-swingup": Entry("dm_control cartpole", 4000, 850.0),
     "mountain-car": Entry("gymnasium MountainCarContinuous-v0", 4000, 90.0),
+    "mountain-car-as-it-is": Entry("gymnasium MountainCarContinuous-v0 as it is", 4000, 90.0),
     "pendulum-v1": Entry("gymnasium Pendulum-v1", 2000, -200.0),
     "acrobot-swingup": Entry("dm_control acrobot", None, 400.0),
 }

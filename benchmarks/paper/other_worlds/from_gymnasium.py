@@ -28,6 +28,17 @@ class MountainCar(System):
         )
 
 
+class CarPerStep(MountainCar):
+    """The same car as the environment shows it: time in steps, speeds of at most 0.07 a step."""
+
+    default_constants = {"motor": 0.002, "slope": 0.0018}
+
+
+def plain_car_env() -> gymnasium.Env:
+    """As it is."""
+    return gymnasium.make("MountainCarContinuous-v0")
+
+
 def mountain_car_env() -> gymnasium.Env:
     """A step counts as 0.1 s, so velocities per step become ten times as large per second."""
     env = gymnasium.make("MountainCarContinuous-v0")
@@ -73,6 +84,20 @@ MOUNTAIN_CAR = Task(
     position_limits={"x": (-1.2, 0.6)},
     reset=Box((-0.6, 0.0), (-0.4, 0.0)),
     coverage=Box((-1.2, -0.7), (0.45, 0.7)),
+    reward=mountain_car_reward,
+    terminated=arrived,
+    exploration_reward=speed,
+)
+PLAIN_CAR = Task(
+    name="gym-mountain-car-as-it-is",
+    system=CarPerStep(),
+    action_high=(1.0,),
+    time_step=1.0,
+    max_steps=999,
+    velocity_limits={"x_dot": 0.07},
+    position_limits={"x": (-1.2, 0.6)},
+    reset=Box((-0.6, 0.0), (-0.4, 0.0)),
+    coverage=Box((-1.2, -0.07), (0.45, 0.07)),
     reward=mountain_car_reward,
     terminated=arrived,
     exploration_reward=speed,

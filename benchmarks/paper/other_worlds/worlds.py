@@ -95,6 +95,12 @@ WORLDS = {
             "no stops, robust loss": Fit(_OPEN_CAR, robust=2.0),
         },
     ),
+    "gymnasium MountainCarContinuous-v0 as it is": OtherWorld(
+        from_gymnasium.PLAIN_CAR,
+        from_gymnasium.plain_car_env,
+        model=_EULER,
+        stops={"x": (-1.2, 0.6)},
+    ),
     "gymnasium Pendulum-v1": OtherWorld(
         from_gymnasium.PENDULUM_V1, from_gymnasium.pendulum_v1_env, model=_EULER
     ),
