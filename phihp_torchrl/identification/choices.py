@@ -20,6 +20,7 @@ from phihp_torchrl.identification.model import NEUTRAL, Model, part_of
 from phihp_torchrl.identification.parts import ActuatorTrial
 from phihp_torchrl.identification.second_look import choose_again, near
 from phihp_torchrl.identification.trials import Trial, Trials
+from phihp_torchrl.identification.undecided import rivals
 from phihp_torchrl.tasks import Actuator, Numbers
 
 _PROMISING = 0.9
@@ -197,11 +198,12 @@ class Chooser:
 
     def table(self) -> tuple[ActuatorTrial, ...]:
         """Every trial, for the report."""
-        rows = []
+        rows, others = [], {id(trial) for trial in rivals(self)}
         for trial in self.tried:
             path = trial.model.actuator(trial.raw)
             cost = self.trials.cost(trial, self.best)
-            rows.append(ActuatorTrial(trial.part, path.config, cost, trial is self.best))
+            kept, rival = trial is self.best, id(trial) in others
+            rows.append(ActuatorTrial(trial.part, path.config, cost, kept, rival))
         return tuple(rows)
 
     def delay(self) -> Numbers:

@@ -21,6 +21,7 @@ from phihp_torchrl.identification.parts import Finding
 from phihp_torchrl.identification.result import Identification
 from phihp_torchrl.identification.spikes import without_spikes
 from phihp_torchrl.identification.stops import noise_level
+from phihp_torchrl.identification.undecided import of_path
 from phihp_torchrl.identification.verdicts import (
     judge_actuator,
     judge_combinations,
@@ -115,6 +116,7 @@ def _report(
         *of_recordings(system, samples),
         *spikes,
         *more,
+        *of_path(fitted.tried),
         *diagnostics.of_fit(division.stopped, division.stops, fitted),
         *beyond,
     ]

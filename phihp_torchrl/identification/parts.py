@@ -48,12 +48,14 @@ class ActuatorTrial:
         values: numbers of the parts, by name.
         cost: robust mean square residual of the trial's windows, in units of the noise.
         kept: whether it became the answer.
+        rival: whether it acts earlier or later than the answer, and is not clearly worse.
     """
 
     part: str
     values: Mapping[str, Numbers]
     cost: float
     kept: bool = False
+    rival: bool = False
 
 
 @dataclass(frozen=True)

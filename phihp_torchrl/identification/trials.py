@@ -14,7 +14,11 @@ from phihp_torchrl.identification.shooting import Shooting, robust
 from phihp_torchrl.identification.windows import Samples, Windows, first_starts
 
 WINDOWS = 160
-"""Windows of a trial; every other one is fitted."""
+"""Windows of a trial; every other one is fitted, where there are enough."""
+_ENOUGH = 24
+"""Windows below which all are fitted and judged, for half of them could tell nothing apart."""
+_PRICE = 2.0
+"""What a fitted number costs, in units of the noise's variance, where all windows are fitted."""
 _CLEAR = 3.0
 """Standard errors by which windows of a richer model must be better, by their ranks or mean."""
 _WORTH = 0.005
@@ -52,7 +56,9 @@ class Trials:
 
     def __init__(self, samples: Samples, windows: Windows) -> None:
         self.samples, self.windows = samples, windows
-        self.teaching = torch.arange(len(windows.time)) % 2 == 0
+        count = len(windows.time)
+        self.apart = count >= _ENOUGH
+        self.teaching = torch.arange(count) % 2 == 0 if self.apart else torch.ones(count).bool()
 
     def attempt(
         self, part: str, model: Model, raw: Tensor, like: Trial | None = None, rounds: int = 1
@@ -80,10 +86,15 @@ class Trials:
             raw, starts, residual = fit.raw, fit.starts, fit.residual
         return Trial(part, model, raw, starts, residual)
 
+    @property
+    def judged(self) -> Tensor:
+        """The windows by which trials are judged, bool ``[W]``: those not fitted, if there are."""
+        return ~self.teaching if self.apart else self.teaching
+
     def losses(self, trial: Trial, sigma: Tensor) -> Tensor:
-        """Robust loss of each window that the trial was not fitted to."""
-        judged = ~self.teaching if bool((~self.teaching).any()) else self.teaching
-        return robust(trial.residual[judged] / sigma).sum((1, 2))
+        """Robust loss of each judged window, and the price of what was fitted to it."""
+        loss = robust(trial.residual[self.judged] / sigma).sum((1, 2))
+        return loss if self.apart else loss + _PRICE * len(trial.raw) / len(loss)
 
     def noise(self, trial: Trial) -> Tensor:
         """What a trial takes for noise, ``[n]``."""
@@ -91,14 +102,13 @@ class Trials:
 
     def cost(self, trial: Trial, best: Trial) -> float:
         """Loss per measurement in units of the noise that ``best`` has."""
-        judged = ~self.teaching if bool((~self.teaching).any()) else self.teaching
-        total = self.losses(trial, self.noise(best)).sum() / self.windows.mask[judged].sum()
-        return float(total)
+        losses = self.losses(trial, self.noise(best))
+        return float(losses.sum() / self.windows.mask[self.judged].sum())
 
     def better(self, trial: Trial, best: Trial) -> bool:
         """Whether windows are clearly better (or all of them), and by half a percent together."""
         sigma = self.noise(best)
-        if self._is_exact(sigma):
+        if self.is_exact(sigma):
             return False
         before = self.losses(best, sigma)
         gain = before - self.losses(trial, sigma)
@@ -109,7 +119,7 @@ class Trials:
         everywhere = bool((gain > 0).all()) and len(gain) >= 5
         return (clear or everywhere) and bool(gain.sum() > _WORTH * before.sum())
 
-    def _is_exact(self, sigma: Tensor) -> bool:
+    def is_exact(self, sigma: Tensor) -> bool:
         """Whether nothing is left but rounding, which no model explains."""
         mask, measured = self.windows.mask, self.windows.measured
         seen = mask.any(0).any(0).nonzero().flatten().tolist()
