@@ -81,6 +81,9 @@ svg path.dots.third, svg path.dots.command { stroke-width: 8; }
   table.stack tbody th { display: block; font-size: 1.05rem; }
   table.stack td::before { content: attr(data-label); color: var(--soft); font-weight: 400; }
   table.stack td.empty { display: none; } }
+@media (max-width: 30rem) {
+  table:not(.stack) { font-size: .8125rem; } table:not(.stack) tbody th { min-width: 0; }
+  table:not(.stack) :is(th, td) { padding-right: .35rem; } }
 @media print {
   :root { color-scheme: light; --paper: #fff; --card: #fff; --ink: #000; --soft: #444;
     --line: #bbb; --measured: #555; --model: #0b62c4; --command: #9a5b00; --good: #1a6b33;

@@ -18,8 +18,9 @@ _ABOUT_CONSTANTS = (
 )
 _ABOUT_ACTUATOR = (
     "What happens to a command before it acts. A part is kept only where it clearly lowers the "
-    "error on windows that it was not fitted to. The cost is the mean square residual of those "
-    "windows in squares of the noise: one means that only noise is left."
+    "error on windows that it was not fitted to, or on all of them, at a price, where they are "
+    "few. The cost is the mean square residual of those windows in squares of the noise: one means "
+    "that only noise is left. What is late by another time and not clearly worse is as good."
 )
 _ABOUT_ERRORS = (
     "Predictions of stretches that took no part in the fit, each begun from the samples before it. "
@@ -72,7 +73,7 @@ def report_page(
         ...     noise={"angle": 0.01}, warnings=(), data={"samples": 3000},
         ... )
         >>> page = report_page(found, title="my <rig>")
-        >>> page[:15], "my &lt;rig&gt;" in page, "identified, ± 0.83 %" in page
+        >>> page[:15], "my &lt;rig&gt;" in page, "identified, ±" in page
         ('<!doctype html>', True, True)
     """
     parts = {

@@ -88,7 +88,7 @@ def _interval(low: float | None, high: float | None) -> str:
 def _precision(e: Estimate) -> str:
     if e.low is None or e.high is None or not e.estimate:
         return ""
-    return f", ± {50 * abs((e.high - e.low) / e.estimate):.2g} %"
+    return f", ±\N{NO-BREAK SPACE}{50 * abs((e.high - e.low) / e.estimate):.2g}\N{NO-BREAK SPACE}%"
 
 
 def actuator_parts(found: Identification) -> str:
@@ -120,7 +120,7 @@ def tried_paths(found: Identification) -> str:
             Cell(escape(trial.part), head=True),
             Cell(escape(", ".join(f"{k} {_numbers(v)}" for k, v in trial.values.items()))),
             Cell(number(trial.cost), "number"),
-            Cell("kept", "kept") if trial.kept else Cell(""),
+            Cell("kept", "kept") if trial.kept else Cell("as good" if trial.rival else ""),
         ]
         for trial in found.actuator.tried
     ]

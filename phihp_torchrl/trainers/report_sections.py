@@ -184,8 +184,8 @@ def learned(rows: Rows, metadata: Mapping[str, Any], truth: Mapping[str, float] 
             f"<p>The network that the equations lack makes {100 * share:.2g} % of the motion: its "
             "part of ds/dt beside that of the equations, over the real steps.</p>\n"
         )
-    for phase, summary in metadata.items():
-        if isinstance(summary, dict) and phase != "seconds":
+    for phase in metadata.get("seconds", {}):
+        if isinstance(summary := metadata.get(phase), dict):
             html += f"<h3>{escape(phase)}</h3>\n{facts(summary)}"
     return html
 

@@ -53,6 +53,11 @@ def test_the_page_of_a_run_has_every_part_and_needs_nothing_from_elsewhere(whole
     ):  # fmt: skip
         assert words in text, words
     assert "alert" not in page
+    metadata = json.loads((whole / "metadata.json").read_text())
+    assert {"config", "digests"} <= metadata.keys()  # which say nothing to a reader
+    assert "<h3>config" not in page
+    assert "<h3>digests" not in page
+    assert not any(digest in text for digest in metadata["digests"].values())
 
 
 def test_the_page_is_safe_with_any_name_and_takes_what_is_there(copied: Path) -> None:
