@@ -43,6 +43,7 @@ TRUTH = {
         "inertia2": 0.09,
     },
     "gymnasium MountainCarContinuous-v0": {"motor": 0.15, "slope": 0.25},
+    "gymnasium MountainCarContinuous-v0 as it is": {"motor": 0.0015, "slope": 0.0025},
     "gymnasium Pendulum-v1": {"mass": 1.0, "length": 1.0},
 }
 
