@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from phihp_torchrl.config import ConfigError
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld, World
+
+_COLUMNS = ("states", "actions", "rewards")
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,7 @@ class Episode:
     Examples:
         >>> from phihp_torchrl import get_task
         >>> steps = np.zeros((3, 2)), np.zeros((2, 1)), np.array([-1.0, -2.0])
-        >>> no_frames = np.zeros((0, 0, 0, 3), dtype=np.uint8)
-        >>> Episode(get_task("pendulum"), *steps, False, no_frames, frame_steps=1).total_reward
+        >>> Episode(get_task("pendulum"), *steps, False).total_reward
         -3.0
     """
 
@@ -46,13 +48,23 @@ class Episode:
     actions: NDArray[np.float64]
     rewards: NDArray[np.float64]
     terminated: bool
-    frames: NDArray[np.uint8]
-    frame_steps: int
+    frames: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 0, 0, 3), np.uint8))
+    frame_steps: int = 1
 
     @property
     def total_reward(self) -> float:
         """The undiscounted return."""
         return float(self.rewards.sum())
+
+    def to_tensors(self) -> dict[str, Any]:
+        """All but the pictures, as a checkpoint keeps it."""
+        columns = {name: torch.from_numpy(getattr(self, name)) for name in _COLUMNS}
+        return {**columns, "terminated": self.terminated}
+
+    @classmethod
+    def from_tensors(cls, task: Task, kept: Mapping[str, Any]) -> Episode:
+        """The episode of :meth:`to_tensors`."""
+        return cls(task, *(kept[name].numpy() for name in _COLUMNS), bool(kept["terminated"]))
 
 
 def play_episode(
@@ -101,11 +113,7 @@ def play_episode(
     steps = task.max_steps if max_steps is None else min(max_steps, task.max_steps)
     if steps < 1:
         raise ConfigError("max_steps", f"expected a positive number, got {max_steps}.")
-    if not frames_per_second > 0:
-        raise ConfigError(
-            "frames_per_second", f"expected a positive number, got {frames_per_second}."
-        )
-    frame_steps = max(1, round(1.0 / (frames_per_second * task.time_step)))
+    frame_steps = _frame_steps(task, frames_per_second)
     world = SimulatedWorld(task) if world is None else world
     if render:
         _check_pygame(world)
@@ -136,9 +144,61 @@ def play_episode(
         actions=torch.stack([row["action"] for row in rows]).double().numpy(),
         rewards=torch.stack([row["next", "reward"].reshape(()) for row in rows]).double().numpy(),
         terminated=bool(rows[-1]["next", "terminated"].any()),
-        frames=np.stack(frames) if render else np.zeros((0, 0, 0, 3), dtype=np.uint8),
+        **({"frames": np.stack(frames)} if render else {}),
         frame_steps=frame_steps,
     )
+
+
+def draw_episode(
+    episode: Episode,
+    world: SimulatedWorld,
+    *,
+    frames_per_second: float = 20.0,
+    max_frames: int = 200,
+) -> Episode:
+    """Draw an episode from its states, which have been played already.
+
+    Args:
+        episode: an episode, such as :attr:`~phihp_torchrl.evaluation.Evaluation.first`.
+        world: the simulated world in which it was played.
+        frames_per_second: pictures for each second in the world, at most one for each step.
+        max_frames: largest number of pictures; later steps have none.
+
+    Returns:
+        The same episode with pictures.
+
+    Raises:
+        ImportError: if pygame is not installed.
+        ConfigError: if the world has no pictures, or ``frames_per_second`` is not positive.
+
+    Examples:
+        >>> from phihp_torchrl.worlds import SimulatedWorld
+        >>> from phihp_torchrl import Agent, get_task
+        >>> from phihp_torchrl.agents import Actor
+        >>> task = get_task("pendulum")
+        >>> episode = play_episode(Agent(task, actor=Actor(task)), task, max_steps=5)
+        >>> draw_episode(episode, SimulatedWorld(task)).frames.shape
+        (6, 500, 500, 3)
+    """
+    _check_pygame(world)
+    frame_steps = _frame_steps(episode.task, frames_per_second)
+    shown = range(0, len(episode.states), frame_steps)[:max_frames]
+    env = world.make_env(render=True)
+    pictures = []
+    for step in shown:
+        action = episode.actions[step - 1] if step else None
+        world.place(env, episode.states[step], action)
+        pictures.append(_picture(world, env))
+    return replace(episode, frames=np.stack(pictures), frame_steps=frame_steps)
+
+
+def _frame_steps(task: Task, frames_per_second: float) -> int:
+    """Steps from one picture to the next."""
+    if not frames_per_second > 0:
+        raise ConfigError(
+            "frames_per_second", f"expected a positive number, got {frames_per_second}."
+        )
+    return max(1, round(1.0 / (frames_per_second * task.time_step)))
 
 
 def _picture(world: World, env: EnvBase) -> NDArray[Any]:

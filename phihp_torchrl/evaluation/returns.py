@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from phihp_torchrl.config import ConfigError, is_whole
 from phihp_torchrl.deployment import plain_defaults
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.evaluation.episode import Episode
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
 from phihp_torchrl.evaluation.violations import Violations
 from phihp_torchrl.tasks import Task, find_task
@@ -41,6 +42,8 @@ class Evaluation:
         chatter: mean change of the action from step to step in the second half of each episode, as
             a share of its half-range, ``[episodes]``; ``None`` where it was not measured.
         violations: violations of the task's constraints by their names; ``None`` without any.
+        first: the first episode in full, without pictures; ``None`` where the world was not a
+            simulated one.
 
     Examples:
         >>> returns, lengths = torch.tensor([-200.0, -100.0]), torch.tensor([200, 200])
@@ -57,6 +60,7 @@ class Evaluation:
     seconds: float
     chatter: Tensor | None = None
     violations: Mapping[str, Violations] | None = None
+    first: Episode | None = field(default=None, repr=False, compare=False)
 
     @property
     def mean(self) -> float:
@@ -143,12 +147,12 @@ def evaluate(
     if env is not None and len(env.batch_size) > 1:
         raise ConfigError("env", f"expected batch size [] or [n], got {list(env.batch_size)}.")
     device = torch.device(device or "cpu") if env is None else (env.device or torch.device("cpu"))
-    start = time.perf_counter()
+    start, first = time.perf_counter(), None
     cuda = [device] if device.type == "cuda" else []
     with torch.random.fork_rng(devices=cuda), torch.no_grad():
         torch.manual_seed(seed if noise_seed is None else noise_seed)
         if model is not None:
-            played = _play_model(policy, model, task, episodes, seed, device)
+            played, first = _play_model(policy, model, task, episodes, seed, device)
         else:
             assert env is not None  # one of the two is there
             env.set_seed(seed)
@@ -159,7 +163,8 @@ def evaluate(
     seconds = time.perf_counter() - start
     found = zip(task.limits.names, steps.unbind(-1), largest.unbind(-1), strict=True)
     violations = {name: Violations(*each) for name, *each in found} or None
-    return Evaluation(task.name, seed, returns, lengths, terminated, seconds, chatter, violations)
+    own = returns, lengths, terminated, seconds, chatter, violations
+    return Evaluation(task.name, seed, *own, first)
 
 
 def _play_model(
@@ -169,8 +174,10 @@ def _play_model(
     episodes: int,
     seed: int,
     device: torch.device,
-) -> tuple[Tensor, ...]:
-    """What a tally has of the episodes in a simulated world; ``judged`` has the constraints.
+) -> tuple[tuple[Tensor, ...], Episode]:
+    """What a tally has of the episodes in a simulated world, and the first episode.
+
+    ``judged`` has the constraints.
 
     An actor alone is four times as fast on the world's tensors as in the TorchRL environment.
     """
@@ -180,6 +187,7 @@ def _play_model(
     drawn = outside.draw([episodes], task.max_steps + 1, torch.Generator().manual_seed(seed))
     drawn = {name: values.to(device) for name, values in drawn.items()}
     tally = _Tally(judged, episodes, device)
+    observed, taken = [world.observe(state)[0]], []
     for step in range(task.max_steps):
         if outside:
             state = task.with_signals(state, outside.window(drawn, step))
@@ -192,12 +200,25 @@ def _play_model(
         next_state, reward, terminated = world.transition(state, action)
         if judged.limits:
             tally.judge(task.split(next_state)[0], task.command(task.split(state)[1], action))
+        observed.append(world.observe(next_state)[0])
+        taken.append((action[0], reward[0]))
         # The state of an episode that has ended is not changed any more.
         state = torch.where((tally.alive & ~terminated).unsqueeze(-1), next_state, state)
         finite = next_state.isfinite().all(-1)
         if tally.add(action, reward, terminated, terminated, finite):
             break
-    return tally.result()
+    return tally.result(), _first_episode(judged, tally, observed, taken)
+
+
+def _first_episode(
+    task: Task, tally: _Tally, observed: list[Tensor], taken: list[tuple[Tensor, Tensor]]
+) -> Episode:
+    """The first of the episodes, of which all observations, actions and rewards are given."""
+    length = int(tally.lengths[0])
+    columns = (torch.stack(list(column)[:length]) for column in zip(*taken, strict=True))
+    actions, rewards = (column.double().cpu().numpy() for column in columns)
+    states = task.locate(torch.stack(observed[: length + 1]).double()).cpu().numpy()
+    return Episode(task, states, actions, rewards, bool(tally.terminated[0]))
 
 
 def _play_env(policy: TensorDictModuleBase, env: EnvBase, task: Task) -> tuple[Tensor, ...]:

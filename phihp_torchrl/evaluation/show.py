@@ -8,12 +8,12 @@ from pathlib import Path
 
 from phihp_torchrl.config import names_file
 from phihp_torchrl.deployment import Agent
-from phihp_torchrl.evaluation.episode import Episode, play_episode
+from phihp_torchrl.evaluation.episode import Episode, draw_episode, play_episode
 from phihp_torchrl.evaluation.figures import Curve, episode_figure
 from phihp_torchrl.evaluation.predicted import Predictions, predict_episode
 from phihp_torchrl.evaluation.seeds import evaluation_seed
 from phihp_torchrl.evaluation.video import write_gif
-from phihp_torchrl.worlds import World
+from phihp_torchrl.worlds import SimulatedWorld, World
 
 DOING = "drawing an episode"
 """What a run says that it is doing while this is on its stack."""
@@ -30,6 +30,7 @@ def show_episode(
     video: bool = True,
     seed: int = 0,
     curve: Curve | None = None,
+    played: Episode | None = None,
 ) -> list[Path]:
     """Play one episode of an agent and write a figure ``<name>.png`` and a GIF ``<name>.gif``.
 
@@ -47,6 +48,7 @@ def show_episode(
         video: whether to write the GIF.
         seed: number of the evaluation seed.
         curve: returns over real steps for the figure: points by what earned them.
+        played: an episode that the agent has played in a simulated world, to show that instead.
 
     Returns:
         The pictures that were written.
@@ -64,17 +66,20 @@ def show_episode(
     """
     directory.mkdir(parents=True, exist_ok=True)
     files = [directory / f"{name}.png"]
-    episode = None
+    world = SimulatedWorld(agent.task) if world is None else world
+    options = {"seed": evaluation_seed(seed), "world": world}
+    episode = played
     if video:
         try:
-            episode = play_episode(
-                agent, agent.task, seed=evaluation_seed(seed), world=world, render=True
-            )
+            if played is not None and isinstance(world, SimulatedWorld):
+                episode = draw_episode(played, world)
+            else:
+                episode = play_episode(agent, agent.task, **options, render=True)
             files.append(write_gif(episode, directory / f"{name}.gif"))
         except (ImportError, ValueError) as error:
             _log.warning("No GIF of the episode: %s", error)
     if episode is None:
-        episode = play_episode(agent, agent.task, seed=evaluation_seed(seed), world=world)
+        episode = play_episode(agent, agent.task, **options)
     predicted = None
     if agent.dynamics is not None:
         predicted = predict_episode(agent.dynamics, episode)

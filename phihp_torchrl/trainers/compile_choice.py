@@ -25,7 +25,7 @@ _STEP, _STEP_SECONDS = (of["chunk"] / _RATES["chunk_steps"] for of in (_SAVED, _
 _GRADIENT, _GRADIENT_SECONDS = (of["update"] / 3 for of in (_SAVED, _SECONDS))
 _RETURN_SECONDS = 5 * _STEP_SECONDS  # the steps of a compiled piece of a return
 # Learning that may end at a plateau is taken to have this share of its updates.
-_PLATEAU = 0.5
+_PLATEAU = 0.9
 
 
 @dataclass(frozen=True)

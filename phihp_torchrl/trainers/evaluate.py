@@ -16,6 +16,7 @@ from phihp_torchrl.deployment import Agent, AgentError, load_agent, save_agent
 from phihp_torchrl.evaluation import (
     BASELINES_KEY,
     EVALUATION_SEED,
+    Episode,
     controllers_table,
     evaluate,
     measure_latency,
@@ -114,6 +115,7 @@ class EvaluatePhase:
         self.results: dict[str, dict[str, Any]] = {}
         self.beside: dict[str, dict[str, Any]] = {}
         self.new_files: list[NewFile] = []
+        self._played: Episode | None = None
         self._steps: list[tuple[str, Agent]] = []
         if agent.planner is not None and world.has_env:
             self._steps.append(("planner", agent))
@@ -159,12 +161,16 @@ class EvaluatePhase:
         return {self.directory.evaluation.name: digest_of(self._text())}
 
     def state_dict(self) -> dict[str, Any]:
-        return {"results": self.results, "beside": self.beside, "finished": self._finished}
+        played = {} if self._played is None else {"played": self._played.to_tensors()}
+        state = {"results": self.results, "beside": self.beside, "finished": self._finished}
+        return {**state, **played}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.results = dict(state["results"])
         self.beside = dict(state.get("beside", {}))
         self._finished = bool(state["finished"])
+        if "played" in state:
+            self._played = Episode.from_tensors(self.agent.task, state["played"])
 
     def restore_files(self) -> None:
         """Write the files of a finished phase again that are gone or damaged since."""
@@ -202,6 +208,7 @@ class EvaluatePhase:
         if settings.latency_actions:
             summary |= measure_latency(agent, task, calls=settings.latency_actions).summary()
         self.results[name] = {**summary, "returns": played.returns.tolist()}
+        self._played = self._played or played.first
         return {f"evaluate/{name}/{key}": value for key, value in summary.items()}
 
     def _beside(self) -> dict[str, dict[str, Any]]:
@@ -253,7 +260,8 @@ class EvaluatePhase:
         # Single plans are compiled already if their time was measured.
         agent = self.agent if self.settings.latency_actions else _eager(self.agent)
         curve = return_curve(read_rows(self.directory.metrics))
-        for path in show_episode(agent, place, world=self.world, video=video, curve=curve):
+        shown = {"video": video, "curve": curve, "played": self._played}
+        for path in show_episode(agent, place, world=self.world, **shown):
             self.new_files.append(NewFile(f"evaluate/{path.stem}{path.suffix}", path))
 
 

@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 # A rise counts if the paired starts show it beyond noise, in standard errors of their mean
 # difference, and if it is more than this share of all that has been gained since the first actor.
-_STANDARD_ERRORS, _SHARE = 2.0, 0.01
+_STANDARD_ERRORS, _SHARE = 2.0, 0.001
 # Before this share of the starts has left the floor, returns that stand still are no plateau.
 _AT_FLOOR = 0.15
 
@@ -76,7 +76,7 @@ class Plateau:
     """Ends learning where the best actor's returns have not risen for a share of the updates.
 
     Actors play from the same starts, so their returns are compared start by start: a rise is one of
-    more than two standard errors of the mean difference, and of more than 1 % of what has been
+    more than two standard errors of the mean difference, and of more than 0.1 % of what has been
     gained since the first actor. While more than 15 % of the starts are at the floor of returns
     (:class:`~phihp_torchrl.trainers.floor.Floor`), learning goes on, for sparse rewards are found
     late.

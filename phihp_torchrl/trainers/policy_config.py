@@ -93,8 +93,8 @@ class PolicyConfig:
     random_fraction: float = 0.1
     max_age: Steps | None = None
     decay: float = 0.5
-    patience: float = 0.0
-    tail: float = 0.1
+    patience: float = 0.4
+    tail: float = 0.15
     evaluation_interval: int = 500
     evaluation_episodes: int = 64
     evaluation_steps: Steps | None = None

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from phihp_torchrl import get_task
-from phihp_torchrl.evaluation import evaluation_seed, play_episode
+from phihp_torchrl.evaluation import evaluate, evaluation_seed, play_episode
+from phihp_torchrl.evaluation.episode import draw_episode
 from phihp_torchrl.worlds import (
     EnvWorld,
     GymnasiumConfig,
@@ -43,6 +44,30 @@ def test_an_episode_is_what_was_evaluated():
     assert np.array_equal(again.states, episode.states)
     other = play_episode(balance(), task, max_steps=50, seed=evaluation_seed(1))
     assert not np.array_equal(other.states, episode.states)
+
+
+@pytest.mark.parametrize("policy", [balance(), constant()], ids=["balance", "fall"])
+def test_the_first_episode_of_an_evaluation_is_kept(policy):
+    """Its states follow from its actions, and it ends and earns as the returns say."""
+    world = SimulatedWorld(replace(get_task("cartpole"), max_steps=60))
+    found = evaluate(policy, world.task, episodes=3)
+    episode = found.first
+    states, actions = torch.from_numpy(episode.states), torch.from_numpy(episode.actions)
+    torch.testing.assert_close(states[1:], world.step(states[:-1], actions), rtol=0, atol=1e-5)
+    assert episode.total_reward == pytest.approx(found.returns[0].item())
+    assert len(episode.rewards) == found.lengths[0]
+    assert episode.terminated == found.terminated[0]
+
+
+def test_an_episode_is_drawn_as_it_was_played():
+    pytest.importorskip("pygame")
+    world = SimulatedWorld("pendulum-swingup")
+    played = play_episode(constant(2.0), world.task, max_steps=30, render=True)
+    drawn = draw_episode(replace(played, frames=np.zeros((0, 0, 0, 3), np.uint8)), world)
+    assert np.array_equal(drawn.frames, played.frames)
+    assert drawn.frame_steps == played.frame_steps
+    few = draw_episode(played, world, frames_per_second=10.0, max_frames=4)
+    assert np.array_equal(few.frames, played.frames[:8:2])
 
 
 def test_states_are_as_they_are_observed():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import replace
 from importlib import import_module
@@ -51,7 +52,11 @@ def test_a_run_leaves_what_it_promises(whole: Path) -> None:
     agent = load_agent(whole / "agent")
     assert agent.metadata["samples"] == 60
     assert agent.metadata["config"]["policy"]["updates"] == 12
-    assert len(agent.metadata["returns"]["planner"]["returns"]) == 2
+    returns = agent.metadata["returns"]["planner"]["returns"]
+    assert len(returns) == 2
+    with (whole / "episode.csv").open(newline="") as file:  # the first of those that count
+        shown = [float(row["reward"]) for row in csv.DictReader(file) if row["reward"]]
+    assert sum(shown) == pytest.approx(returns[0], rel=1e-5)
 
 
 def test_a_seed_repeats_a_run_and_another_does_not(whole: Path, tmp_path: Path) -> None:

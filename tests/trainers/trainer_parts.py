@@ -45,6 +45,7 @@ POLICY = PolicyConfig(
     evaluation_episodes=4,
     evaluation_steps=5,
     real_evaluation_episodes=2,
+    patience=0.0,
     td3=TD3Config(
         actor_hidden_sizes=(8, 8),
         critic_hidden_sizes=(8, 8),

@@ -135,6 +135,18 @@ class SimulatedWorld(World):
     def picture(self, env: EnvBase) -> NDArray[Any] | None:
         return env.base_env._env.render()
 
+    def place(self, env: EnvBase, state: NDArray[Any], action: NDArray[Any] | None = None) -> None:
+        """Put an environment of this world into a state, to draw it.
+
+        Args:
+            env: an environment of :meth:`make_env`.
+            state: the physical state, or a state of the task, ``[n]`` or more.
+            action: the action that led there, ``[m]``; ``None`` at the start.
+        """
+        wrapped = env.base_env._env
+        wrapped.reset(options={"state": state[: len(self.task.system.state_names)]})
+        wrapped.unwrapped.last_action = action
+
     def make_batch(
         self,
         batch_size: Sequence[int],

@@ -9,7 +9,7 @@ import pytest
 
 from phihp_torchrl import load_config
 from phihp_torchrl.trainers import read_run_config
-from uncertainty import RESULTS, VARIANTS, cost, gains, interval, settings, write_tables
+from uncertainty import NARROW, RESULTS, VARIANTS, cost, gains, interval, settings, write_tables
 
 ORIGIN = {
     "commit": "5e6e490c0ffee",
@@ -50,6 +50,14 @@ def test_updates_are_a_limit():
     assert settings("pendulum", "plain", 100, 10**9) == settings("pendulum", "plain", 100, None)
 
 
+def test_narrow_networks_are_settings_that_the_table_names():
+    lines = settings("acrobot", "plain", 100, None, NARROW)
+    td3 = read_run_config(load_config("acrobot", overrides=lines)).section("policy").td3
+    assert (td3.actor_hidden_sizes, td3.critic_hidden_sizes) == ((128, 128), (128, 128, 128))
+    (row,) = gains([made("plain", 100, [1.0]) | {"settings": lines}], "planner")
+    assert row[5] == "narrow"
+
+
 def test_an_interval_is_students_over_seeds():
     mean, half = interval([1.0, 2.0, 3.0])
     assert mean == 2.0
@@ -65,9 +73,10 @@ def test_a_gain_is_taken_seed_by_seed():
         made("both", 101, [104.0, 106.0], seconds=30.0),
     ]
     plain, both = gains(runs, "planner")
-    assert plain[:6] == ["pendulum-swingup", "plain", "2", "250", "100", "51.0 ± 635.3"]
-    assert plain[6:] == ["", "", ""]
-    assert both[6:] == ["3.0 ± 12.7", "3.00", "3.00"]
+    assert plain[:6] == ["pendulum-swingup", "plain", "2", "250", "100", "default"]
+    assert plain[6] == "51.0 ± 635.3"
+    assert plain[7:] == ["", "", ""]
+    assert both[7:] == ["3.0 ± 12.7", "3.00", "3.00"]
 
 
 def test_an_update_costs_what_it_does_once_all_is_compiled():
@@ -79,7 +88,7 @@ def test_an_update_costs_what_it_does_once_all_is_compiled():
 
 def test_a_variant_without_plain_runs_has_no_gain():
     (row,) = gains([made("both", 100, [1.0])], "planner")
-    assert row[5:] == ["1.0 one seed", "", "", ""]
+    assert row[6:] == ["1.0 one seed", "", "", ""]
 
 
 def test_the_tables_hold_what_the_files_hold(tmp_path):
@@ -89,10 +98,8 @@ def test_the_tables_hold_what_the_files_hold(tmp_path):
             (tmp_path / f"{variant}-{seed}.json").write_text(json.dumps(run))
     write_tables(tmp_path)
     text = (tmp_path / "README.md").read_text()
-    assert (
-        "| pendulum-swingup | ensemble | 2 | 250 | 100 | 1.5 ± 0.0 | 0.0 ± 0.0 | 1.00 | 1.00 |"
-        in text
-    )
+    row = "| ensemble | 2 | 250 | 100 | default | 1.5 ± 0.0 | 0.0 ± 0.0 | 1.00 | 1.00 |"
+    assert row in text
     assert "Training seeds: 100, 101. Commits: 5e6e490." in text
     assert "both |" not in text
     assert "constants |" not in text
