@@ -19,6 +19,8 @@ from phihp_torchrl.config import (
     compose_yaml,
     file_error,
     open_mappings,
+    override_key,
+    parse_overrides,
     publish_offers,
 )
 from phihp_torchrl.evaluation import controllers_table, returns_table
@@ -49,13 +51,30 @@ def launch(words: Sequence[str], settings: Sequence[str], config_dir: str | None
     Raises:
         ConfigError: for settings that cannot be composed.
     """
-    if "-m" not in words and "--multirun" not in words:
+    if "-m" in words or "--multirun" in words:
+        _check_folders(settings)
+    else:
         compose_yaml(settings, config_dir)  # whose errors name the key
     publish_offers(*([] if config_dir is None else [config_dir]))
     # Hydra's parser takes assignments in one place alone, and not on both sides of a flag.
     flags = [word for word in words if word not in set(settings)]
     sys.argv = [sys.argv[0], *flags, *open_mappings(settings)]
     hydra.main(version_base="1.3", config_path=f"pkg://{MODULE}", config_name="train")(job)()
+
+
+def _check_folders(settings: Sequence[str]) -> None:
+    """Refuse a multirun of several runs in one folder, where the second would find the first."""
+    lines = {override_key(line): line for line in parse_overrides(settings)}
+    if not (swept := [key for key, line in lines.items() if line.is_sweep_override()]):
+        return
+    for key in ("run_dir", "resume"):
+        if key in lines and key not in swept and "${" not in str(lines[key].value()):
+            raise ConfigError(
+                key,
+                f"expected a folder for each run of the multirun over {', '.join(swept)}, got "
+                f"{lines[key].value()!r} for all of them; without {key} each makes its own under "
+                "outputs/.",
+            )
 
 
 def job(composed: DictConfig) -> None:

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from phihp_torchrl.config import check_not_negative, check_positive
+from phihp_torchrl.config import ConfigError, check_not_negative, check_positive
 from phihp_torchrl.dynamics.hybrid import HybridDynamics
 from phihp_torchrl.dynamics.residual import spread
 
@@ -123,11 +123,24 @@ class DynamicsLoss(LossModule):
 
         The states are those of the system, and the action is what acts on it: the command in
         bounds, behind the task's actuator if it has one.
+
+        Raises:
+            ConfigError: for a key that is missing or has another shape than its task and the rest
+                of the transitions, and for none at all, whose mean error would be no number.
         """
-        task, keys = self.dynamics.task, self.tensor_keys
-        following = tensordict.get("next").get(keys.observation)
-        state, registers = task.split(task.locate(tensordict.get(keys.observation)))
-        action, _ = task.acting(registers, tensordict.get(keys.action))
+        task = self.dynamics.task
+        seen, command, following = (tensordict.get(key, None) for key in self.in_keys)
+        batch = tensordict.batch_size if seen is None else seen.shape[:-1]
+        sizes = task.observation_dim, task.action_dim, task.observation_dim
+        for key, given, size in zip(self.in_keys, (seen, command, following), sizes, strict=True):
+            if given is None or given.shape != (*batch, size):
+                name = key if isinstance(key, str) else ".".join(key)
+                got = "none" if given is None else f"shape {list(given.shape)}"
+                raise ConfigError(name, f"expected shape {[*batch, size]}, got {got}.")
+        if not batch.numel():
+            raise ConfigError("tensordict", f"expected transitions, got a batch of {list(batch)}.")
+        state, registers = task.split(task.locate(seen))
+        action, _ = task.acting(registers, command)
         return state, action, task.split(task.locate(following))[0]
 
     def time_step(self, tensordict: TensorDictBase) -> Tensor | None:

@@ -14,9 +14,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from phihp_torchrl.config import ConfigError, is_whole
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment import plain_defaults
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.evaluation.acted import acted, whole
 from phihp_torchrl.evaluation.episode import Episode
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
 from phihp_torchrl.evaluation.violations import Violations
@@ -127,7 +128,8 @@ def evaluate(
         device: device of the policy, for a simulated world.
 
     Raises:
-        ConfigError: if ``episodes`` is not positive, or ``env`` has more than one batch dimension.
+        ConfigError: if ``episodes`` is not positive, ``env`` has more than one batch dimension, or
+            the policy writes no action of the right shape.
 
     Examples:
         >>> from tensordict.nn import TensorDictModule
@@ -136,8 +138,8 @@ def evaluate(
         >>> result.returns.shape, bool((result.lengths < 500).all())
         (torch.Size([10]), True)
     """
-    if not is_whole(episodes, 1):
-        raise ConfigError("episodes", f"expected a positive whole number, got {episodes!r}.")
+    episodes = whole("episodes", episodes, "a positive whole number", 1)
+    seed = whole("seed", seed, "a whole number from 0 on", 0)
     task = find_task(task)
     model = None
     if env is None:
@@ -196,7 +198,7 @@ def _play_model(
             is_init=torch.full([episodes, 1], step == 0, device=device),
             batch_size=[episodes],
         )
-        action = policy(tensordict)["action"]
+        action = acted(policy(tensordict), (episodes, task.action_dim))
         next_state, reward, terminated = world.transition(state, action)
         if judged.limits:
             tally.judge(task.split(next_state)[0], task.command(task.split(state)[1], action))
@@ -228,6 +230,7 @@ def _play_env(policy: TensorDictModuleBase, env: EnvBase, task: Task) -> tuple[T
     is_init = torch.ones([*env.batch_size, 1], dtype=torch.bool, device=tensordict.device)
     for _ in range(task.max_steps):
         tensordict = policy(tensordict.set("is_init", is_init))
+        acted(tensordict, env.action_spec.shape)
         # A world whose episode is over starts another, which does not count.
         tensordict, following = env.step_and_maybe_reset(tensordict)
         step = tensordict.get("next")

@@ -50,6 +50,8 @@ class Constant:
 
     def __post_init__(self) -> None:
         plain_fields(self)
+        if not all(isinstance(each, (int, float)) for each in (self.guess, self.low, self.high)):
+            raise ConfigError("guess", f"expected numbers, got {self}.")
         if not (math.isfinite(self.guess) and math.isfinite(self.low)):
             raise ConfigError("guess", f"expected finite numbers, got {self}.")
         if self.high == math.inf and self.low != 0.0 and not self.fixed:

@@ -19,7 +19,8 @@ def check_functions(task: Task) -> None:
     """Call all functions of a task and of its system, and compare what comes with what should.
 
     Each is called for a few start states in a batch ``[6]``, in a batch ``[2, 3]`` and one by one.
-    Shape and dtype must be right, numbers finite, and each row the same in every batch.
+    Shape, dtype and device must be right, numbers finite, each row the same in every batch, and
+    what a function is given must stay as it is, for others read it too.
 
     Args:
         task: the task.
@@ -116,6 +117,7 @@ class _Check:
         none: bool,
     ) -> Any:
         shapes = ", ".join(str(list(argument.shape)) for argument in arguments)
+        before = [argument.clone() for argument in arguments]
         try:
             with torch.no_grad():
                 given = function(*arguments)
@@ -126,6 +128,13 @@ class _Check:
             raise ConfigError(
                 key, f"it failed for tensors of shape {shapes}: {type(error).__name__}: {error}"
             ) from error
+        for number, (argument, kept) in enumerate(zip(arguments, before, strict=True), 1):
+            if not torch.equal(argument, kept):
+                raise ConfigError(
+                    key,
+                    f"expected it to leave what it is given as it is, it changed argument {number} "
+                    f"of {len(arguments)} in place; compute with new tensors.",
+                )
         if given is None and none:
             return None
         kind = str(dtype).removeprefix("torch.")
@@ -135,6 +144,10 @@ class _Check:
         if given.shape != shape or given.dtype != dtype:
             got = str(given.dtype).removeprefix("torch.")
             raise ConfigError(key, f"{expected}, got {got} of shape {list(given.shape)}.")
+        if given.device != arguments[0].device:
+            raise ConfigError(
+                key, f"expected a tensor on {arguments[0].device}, got one on {given.device}."
+            )
         if not given.isfinite().all():
             raise ConfigError(
                 key, f"expected finite numbers, got {given.tolist()} for {arguments[0].tolist()}."

@@ -24,6 +24,7 @@ class Context:
         world: the real world.
         before: the earlier phases of the run, which are done, by name.
         directory: directory of the run.
+        compile: whether the phase is compiled: the run's choice where its settings say ``auto``.
 
     Examples:
         >>> from pathlib import Path
@@ -41,11 +42,7 @@ class Context:
     world: World
     before: Mapping[str, Any]
     directory: RunDirectory
-
-    @property
-    def compile(self) -> bool:
-        """Whether the phase is compiled, as the run has chosen."""
-        return self.config.compile is True
+    compile: bool = False
 
     @property
     def parts(self) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 import uuid
 from pathlib import Path
@@ -11,6 +12,10 @@ from phihp_torchrl.config import ConfigError, names_file
 
 STAGE = ".stage"
 """Ending of files that are being written."""
+
+_CLIENTS_LOG = re.compile(r"wandb/[^/]+/logs/debug-core\.log")
+_SERVICES_LOG = re.compile(r"core-debug-\w+\.log")
+"""A link that wandb's client leaves in the folder of each session, and the file it leads to."""
 
 
 def write_atomically(path: Path, text: str) -> None:
@@ -32,7 +37,8 @@ def check_contained(directory: str | Path) -> None:
     """Refuse a folder with links that lead out of it, and with what is neither file nor folder.
 
     A run writes into its folder and removes old files there, which such a link would lead
-    elsewhere.
+    elsewhere. The link that wandb's client leaves to the log of its own service may stay: it lies
+    in the folder of a session that has ended, to which nothing is written any more.
 
     Raises:
         ConfigError: for the first such entry.
@@ -43,12 +49,18 @@ def check_contained(directory: str | Path) -> None:
         for path in (Path(parent, name) for name in (*folders, *names)):
             mode = path.lstat().st_mode
             if stat.S_ISLNK(mode):
-                if not path.resolve().is_relative_to(root):
+                if not (path.resolve().is_relative_to(root) or _is_clients(path, top)):
                     raise ConfigError(
                         str(path), f"a link out of the folder of the run, to {os.readlink(path)}."
                     )
             elif not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
                 raise ConfigError(str(path), "expected a file or a folder, it is neither.")
+
+
+def _is_clients(link: Path, top: Path) -> bool:
+    """Whether a link is that of wandb's client to the log of its service."""
+    place, target = link.relative_to(top).as_posix(), Path(os.readlink(link)).name
+    return bool(_CLIENTS_LOG.fullmatch(place) and _SERVICES_LOG.fullmatch(target))
 
 
 def remove_stages(directory: Path) -> None:

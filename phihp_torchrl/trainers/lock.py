@@ -65,6 +65,16 @@ class RunLock:
             raise
         return self
 
+    def check(self) -> None:
+        """Raise as entering does if another process has the run, and touch nothing."""
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout as error:
+            raise self._taken() from error
+        except (OSError, NotImplementedError):
+            return  # entering says what is wrong
+        self._lock.release()
+
     def __exit__(self, *_: object) -> None:
         (self.directory / OWNER).unlink(missing_ok=True)
         self._lock.release()

@@ -7,7 +7,7 @@ import random
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -223,12 +223,13 @@ class _Run:
             world = known if isinstance(known, World) else world
         settings = resolve_seconds(self.config.section(name), world.task.time_step)
         context = Context(
-            config=replace(self.config, compile=self._compiles(name, settings, world)),
+            config=self.config,
             settings=settings,
             task=world.task,
             world=world,
             before=dict(self.phases),
             directory=self.directory,
+            compile=self._compiles(name, settings, world),
         )
         return PHASES[name].build(context)
 

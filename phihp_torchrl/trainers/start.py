@@ -11,7 +11,7 @@ from typing import Any
 from phihp_torchrl.config import ConfigError, differences, digest_of_values, get_method
 from phihp_torchrl.trainers.checkpoints import load_state
 from phihp_torchrl.trainers.files import STAGE, check_contained, remove_stages
-from phihp_torchrl.trainers.lock import LOCK, OWNER
+from phihp_torchrl.trainers.lock import LOCK, OWNER, RunLock
 from phihp_torchrl.trainers.next_steps import resume_command
 from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig, is_enabled
 from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
@@ -38,6 +38,8 @@ def new_directory(config: RunConfig, path: str | Path | None) -> tuple[RunConfig
     if path is None:
         path = new_run_directory(config.task, config.label)
     directory = RunDirectory(path, config.keep_checkpoints)
+    if directory.config.exists():
+        RunLock(directory.path).check()  # by whom it is taken says more than that it is
     _check_free(directory)
     try:
         directory.path.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.trainers.yaml_file import read_yaml
+from phihp_torchrl.trainers.yaml_file import parse_yaml
 
 _MAX_BYTES, _MAX_DEPTH = 1_000_000, 40
 
@@ -24,10 +24,13 @@ def read_stored(path: Path) -> dict[str, Any]:
         ConfigError: naming the file and, for an interpolation, its key.
     """
     try:
-        if path.stat().st_size > _MAX_BYTES:
+        with path.open("rb") as file:  # once: what is checked is what is read
+            data = file.read(_MAX_BYTES + 1)
+        if len(data) > _MAX_BYTES:
             raise ConfigError(str(path), f"expected at most {_MAX_BYTES} bytes of settings.")
-        _check_events(path, path.read_text(encoding="utf-8"))
-        config = read_yaml(path)
+        text = data.decode("utf-8")
+        _check_events(path, text)
+        config = parse_yaml(text)
     except ConfigError:
         raise
     except Exception as error:  # YAML's and the system's errors have no base

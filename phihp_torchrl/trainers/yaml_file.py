@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import yaml
@@ -36,25 +35,20 @@ _Loader.add_implicit_resolver(
 )
 
 
-def read_yaml(path: Path) -> Any:
-    r"""Read a file of plain values.
+def parse_yaml(text: str) -> Any:
+    r"""Read a text of plain values.
 
     Args:
-        path: the file.
+        text: the content of a file.
 
     Returns:
         What it says: mappings, lists, texts, numbers, booleans and ``None``.
 
     Raises:
         yaml.YAMLError: if it is no YAML, has a key twice, or asks for objects of Python.
-        OSError: if it cannot be read.
 
     Examples:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "settings.yaml"
-        >>> _ = path.write_text("task: pendulum\ntolerance: 1e-3\nday: 2026-01-31\n")
-        >>> read_yaml(path)
+        >>> parse_yaml("task: pendulum\ntolerance: 1e-3\nday: 2026-01-31\n")
         {'task': 'pendulum', 'tolerance': 0.001, 'day': '2026-01-31'}
     """
-    with path.open(encoding="utf-8") as file:
-        return yaml.load(file, Loader=_Loader)  # it makes plain values alone
+    return yaml.load(text, Loader=_Loader)  # it makes plain values alone

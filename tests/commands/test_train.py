@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,37 @@ def test_a_sweep_is_a_run_for_each_value(phihp: Command, place: Path) -> None:
     seeds = [yaml.safe_load((run / "config.yaml").read_text())["seed"] for run in runs]
     assert sorted(seeds) == [0, 1]
     assert all((run / "metrics.csv").is_file() for run in runs)
+
+
+@pytest.mark.parametrize("key", ["run_dir", "resume"])
+def test_a_sweep_in_one_folder_is_refused_before_its_first_run(
+    phihp: Command, place: Path, key: str
+) -> None:
+    with pytest.raises(SystemExit, match=rf"^error: {key}: expected a folder for each .* seed, .*"):
+        phihp("train", "-m", *MODEL, "seed=0,1", f"{key}=mine")
+    assert not list(place.iterdir())
+
+
+def test_a_sweep_over_folders_may_name_them(phihp: Command, place: Path) -> None:
+    phihp("train", "-m", *MODEL, "run_dir=runs/one,runs/two")
+    phihp("train", "-m", *MODEL, "seed=3,4", "run_dir=runs/seed-${seed}")
+    found = sorted(path.parent.name for path in (place / "runs").glob("*/report.html"))
+    assert found == ["one", "seed-3", "seed-4", "two"]
+
+
+@pytest.mark.slow  # two processes of their own, which import torch
+@pytest.mark.timeout(300)
+def test_runs_beside_each_other_in_one_folder_lose_nothing(place: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    words = ["task=pendulum", "seed=0,1", "phases=[model]", *FAST]
+    command = [sys.executable, "-m", "phihp_torchrl", "train", "-m", "hydra/launcher=joblib"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run([*command, "hydra.launcher.n_jobs=2", *words], env=environment, check=True)
+    runs = list((place / "outputs" / "pendulum").iterdir())
+    kept = [yaml.safe_load((run / "config.yaml").read_text()) for run in runs]
+    assert sorted(settings["seed"] for settings in kept) == [0, 1]
+    assert [len((run / "metrics.csv").read_text().splitlines()) for run in runs] == [3, 3]
+    assert all((run / "report.html").is_file() for run in runs)
 
 
 def test_flags_may_stand_between_settings(phihp: Command, place: Path) -> None:

@@ -12,6 +12,7 @@ from tests.docs.blocks import ROOT
 
 EXPECTED = {
     "collect.py": ["40 (8, 1)"],
+    "collect_async.py": ["40 (8, 1)"],
     "parallel.py": ["(2, 50) False", "[False, True]"],
 }
 
@@ -34,6 +35,8 @@ SEEDS = "import os, torch; os.register_at_fork(after_in_child=torch.seed)"
 @pytest.mark.timeout(300)  # importing TorchRL takes long where many share the machine
 def test_scripts_print_what_the_page_says(place):
     (place / "seeds.py").write_text(SEEDS)
+    script = (place / "collect.py").read_text()  # of the other collector the page says: the same
+    (place / "collect_async.py").write_text(script.replace("MultiSync", "MultiAsync"))
     paths = os.pathsep.join([str(place), str(ROOT)])
     environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(

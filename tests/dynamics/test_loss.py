@@ -6,6 +6,8 @@ import math
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import nn
 from torchrl.objectives import LossModule
@@ -263,6 +265,36 @@ def test_unknown_key():
 def test_errors_name_the_argument(options, name):
     with pytest.raises(ConfigError, match=f"^{name}: expected "):
         DynamicsLoss(HybridDynamics.hybrid(TASK), **options)
+
+
+SHAPES = st.lists(st.integers(0, 3), max_size=3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(batch=st.lists(st.integers(0, 3), max_size=2), other=SHAPES, number=st.integers(0, 3))
+def test_transitions_of_any_shape_give_a_number_or_are_refused_by_name(batch, other, number):
+    """A shape that broadcasts would give a wrong number without a word."""
+    loss = DynamicsLoss(HybridDynamics.hybrid(TASK))
+    sizes = {"observation": TASK.observation_dim, "action": TASK.action_dim}
+    sizes["next_observation"] = TASK.observation_dim
+    shapes = {name: [*batch, size] for name, size in sizes.items()}
+    right = dict(shapes)
+    if number < 3:
+        shapes[list(shapes)[number]] = other
+    given_ = {name: torch.rand(shape) for name, shape in shapes.items()}
+    if 0 in batch or shapes != right:
+        named = r"^(observation|action|next\.observation|tensordict): expected"
+        with pytest.raises(ConfigError, match=named):
+            loss(**given_)
+    else:
+        assert all(value.isfinite() for value in loss(**given_))
+
+
+@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
+def test_a_missing_key_is_named(key):
+    data = real_transitions(count=8).exclude(key)
+    with pytest.raises(ConfigError, match=r"^(next\.)?(observation|action): expected shape"):
+        DynamicsLoss(HybridDynamics.hybrid(TASK))(data)
 
 
 def test_gradients_reach_prior_and_residual_alike():

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import GymEnv
 
 from phihp_torchrl import evaluate, get_task
 from phihp_torchrl.agents import Actor, make_actor
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.evaluation import measure_latency, play_episode
 from phihp_torchrl.tasks import list_tasks
 from phihp_torchrl.worlds import (
@@ -190,6 +196,44 @@ def test_summary_is_numbers():
     assert all(isinstance(value, float) and math.isfinite(value) for value in summary.values())
     assert summary["return_min"] <= summary["return_mean"] <= summary["return_max"]
     assert evaluate(constant(), "cartpole", episodes=1).std == 0.0
+
+
+SIZES = st.lists(st.sampled_from([1, 2, 3]), max_size=3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(shape=SIZES, in_env=st.booleans())
+def test_an_action_of_another_shape_is_refused_by_name(shape, in_env):
+    """It would break within the world, or be spread over all episodes."""
+    task = replace(get_task("pendulum"), max_steps=2)
+    policy = Noisy()
+    action = torch.zeros(shape)
+    right = shape == [3, 1]
+    policy.forward = lambda td: td.set("action", action) if right else TensorDict(action=action)
+    env = SimulatedWorld(task).make_batch([3]) if in_env else None
+    if right:
+        assert evaluate(policy, task, episodes=3, env=env).returns.isfinite().all()
+    else:
+        message = f"policy: expected it to write 'action' of shape [3, 1], got shape {shape}."
+        with pytest.raises(ConfigError, match=f"^{re.escape(message)}$"):
+            evaluate(policy, task, episodes=3, env=env)
+
+
+def test_a_policy_that_writes_no_action_is_named():
+    elsewhere = TensorDictModule(lambda seen: seen[..., :1], ["observation"], ["torque"])
+    for world in (None, EnvWorld(get_task("pendulum"), SimulatedWorld("pendulum").make_env)):
+        with pytest.raises(ConfigError, match=r"^policy: expected it to write .* got none"):
+            evaluate(elsewhere, "pendulum", episodes=1, world=world)
+
+
+def test_numbers_of_numpy_are_numbers():
+    found, expected = (
+        evaluate(constant(), "cartpole", episodes=kind(2), seed=kind(5)) for kind in (np.int64, int)
+    )
+    assert torch.equal(found.returns, expected.returns)
+    for seed in (-1, 1.5, True, "1"):
+        with pytest.raises(ConfigError, match=r"^seed: expected a whole number from 0 on, got"):
+            evaluate(constant(), "cartpole", episodes=1, seed=seed)
 
 
 def test_bad_arguments_are_named():

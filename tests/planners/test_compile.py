@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -59,8 +64,8 @@ def test_compiled_equals_eager():
 
 @pytest.mark.slow
 def test_compiled_by_inductor_equals_eager():
-    torch._dynamo.reset()
     """The search; rollouts, whose models are learned and have actors, have a test of their own."""
+    torch._dynamo.reset()
     task, _, actor, _ = task_parts("pendulum")
     env = WorldModelEnv(SimulatedWorld(task).model())
     observation = task.observe(task.coverage.sample([]))
@@ -70,6 +75,47 @@ def test_compiled_by_inductor_equals_eager():
     noise = noise_for(eager)
     actions = [planner.planning(tensordict, noise) for planner in (eager, compiled)]
     torch.testing.assert_close(*actions, atol=1e-4, rtol=1e-4)
+
+
+COMPILING = """
+import json, sys, torch
+from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.planners import cem_plan
+from planners.cem_parts import draw, settings
+from points import ZEROS, point_problem
+
+chosen = settings(planning_horizon=1, optim_steps=1, num_candidates=4, top_k=2)
+problem, noise = point_problem(), draw(chosen)
+plan = lambda observation: cem_plan(observation, noise, problem=problem, settings=chosen).actions
+compiled = compile_graph(plan)
+print("ready", flush=True)
+sys.stdin.readline()
+with torch.no_grad():
+    print(json.dumps([compiled(ZEROS).tolist(), plan(ZEROS).tolist()]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)  # on an idle machine half a minute, most of it for imports
+def test_two_processes_may_compile_with_one_cache_at_the_same_time(tmp_path):
+    tests = Path(__file__).parents[1]
+    paths = os.pathsep.join([str(tests), str(tests.parent)])
+    own = {"TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": paths}
+    pipe, environment = subprocess.PIPE, {**os.environ, **own, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", COMPILING]
+    both = [
+        subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment)
+        for _ in range(2)
+    ]
+    assert [process.stdout.readline() for process in both] == ["ready\n"] * 2
+    for process in both:
+        process.stdin.write("\n")
+        process.stdin.flush()
+    first, second = (process.communicate()[0] for process in both)
+    assert [process.returncode for process in both] == [0, 0]
+    assert first == second
+    found, expected = (torch.tensor(part) for part in json.loads(first))
+    torch.testing.assert_close(found, expected)
 
 
 def test_what_cannot_compile_says_so(caplog):

@@ -253,6 +253,9 @@ def test_a_guess_lies_between_its_limits_or_is_refused(guess, low, high):
     ("options", "key"),
     [
         ({"guess": math.nan}, "guess"),
+        ({"guess": "9.81"}, "guess"),
+        ({"guess": None}, "guess"),
+        ({"guess": 1.0, "high": "2"}, "guess"),
         ({"guess": math.inf}, "guess"),
         ({"guess": math.nan, "fixed": True}, "guess"),
         ({"guess": 0.0}, "guess"),

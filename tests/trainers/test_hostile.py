@@ -6,7 +6,7 @@ import json
 import os
 import pickle
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from torchrl.checkpoint import CheckpointError
 
 from phihp_torchrl.config import ConfigError, compose_yaml, digest_of, sealed
 from phihp_torchrl.trainers import RunResult, read_request, run
+from phihp_torchrl.trainers.files import check_contained
 from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.trainers.trust import STATE_VARIABLE, check_trusted, named_code, sign
 
@@ -264,6 +265,33 @@ DAMAGED = (
     adapter_of_torch, pickled_tensors, pickled_tensordict, path_outside, giant_header,
     tree_of_nonsense, nested_tree, random_state_of_nonsense,
 )  # fmt: skip
+
+
+LOG = "core-debug-20260131_120000.log"  # as wandb's client calls the log of its service
+
+
+@pytest.mark.parametrize(
+    ("link", "target", "refused"),
+    [
+        ("wandb/offline-run-1/logs/debug-core.log", LOG, False),
+        ("wandb/offline-run-1/logs/debug-core.log", ".bashrc", True),
+        ("wandb/offline-run-1/logs/debug.log", LOG, True),
+        ("wandb/offline-run-1/files/logs/debug-core.log", LOG, True),
+        ("wandb/debug-core.log", LOG, True),
+        ("checkpoints/wandb/offline-run-1/logs/debug-core.log", LOG, True),
+        ("wandb/offline-run-1/logs", LOG, True),
+        ("wandb", LOG, True),
+    ],
+)
+def test_the_log_of_wandbs_service_alone_may_lie_elsewhere(
+    tmp_path: Path, link: str, target: str, refused: bool
+) -> None:
+    (tmp_path / target).write_text("")
+    path = tmp_path / "run" / link
+    path.parent.mkdir(parents=True)
+    path.symlink_to(tmp_path / target)
+    with pytest.raises(ConfigError, match="a link out") if refused else nullcontext():
+        check_contained(tmp_path / "run")
 
 
 def test_the_flag_is_named_and_does_what_it_says(

@@ -55,6 +55,8 @@ def test_a_second_process_is_refused_and_harms_nothing(
     try:
         with pytest.raises(ConfigError, match=r"process 4711 on host 'the-cluster', since noon"):
             run(tally_config(), place, resume=True)
+        with pytest.raises(ConfigError, match=r"process 4711 on host 'the-cluster', since noon"):
+            run(tally_config(), place)  # which it holds already is not the point
         (place / OWNER).unlink()
         assert {p: p.read_bytes() for p in place.rglob("*") if p.is_file()} == before
         with pytest.raises(ConfigError, match="not yet given its name"):
@@ -64,6 +66,8 @@ def test_a_second_process_is_refused_and_harms_nothing(
         process.communicate()
     # Killed, it cannot give the lock up; the system does, and what it wrote is stale.
     (place / OWNER).write_text(json.dumps({"pid": 4711, "host": "the-cluster", "since": "noon"}))
+    with pytest.raises(ConfigError, match="holds a run already; go on with"):
+        run(tally_config(), place)
     with caplog.at_level(logging.WARNING):
         assert run(tally_config(), place, resume=True).finished
     assert "process 4711 on host 'the-cluster', since noon had" in caplog.text

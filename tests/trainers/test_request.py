@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
@@ -20,7 +21,7 @@ from phihp_torchrl.trainers import (
     read_run_config,
     run,
 )
-from phihp_torchrl.trainers.yaml_file import read_yaml
+from phihp_torchrl.trainers.yaml_file import parse_yaml
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 from .run_parts import CONFIG, with_sections
@@ -121,7 +122,7 @@ def test_a_file_is_read_as_omegaconf_reads_it() -> None:
     """Which wrote it."""
     for path in (COMMITTED[0], COMMITTED[len(COMMITTED) // 2], COMMITTED[-1]):
         expected = OmegaConf.to_container(OmegaConf.load(path / "config.yaml"))
-        assert read_yaml(path / "config.yaml") == expected
+        assert parse_yaml((path / "config.yaml").read_text(encoding="utf-8")) == expected
 
 
 @pytest.mark.parametrize(
@@ -131,11 +132,11 @@ def test_a_file_is_read_as_omegaconf_reads_it() -> None:
      "???"],
 )  # fmt: skip
 def test_values_are_those_of_omegaconf(tmp_path: Path, value: str) -> None:
-    (tmp_path / "config.yaml").write_text(f"seed: 1\nvalue: {value}\n")
-    ours, theirs = (
-        load(tmp_path / "config.yaml")["value"]
-        for load in (read_yaml, lambda p: OmegaConf.to_container(OmegaConf.load(p)))
-    )
+    text = f"seed: 1\nvalue: {value}\n"
+    (tmp_path / "config.yaml").write_text(text)
+    ours = parse_yaml(text)["value"]
+    read: Any = OmegaConf.to_container(OmegaConf.load(tmp_path / "config.yaml"))
+    theirs = read["value"]
     assert (type(ours), ours) == (type(theirs), theirs)
 
 

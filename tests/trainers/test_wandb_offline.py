@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from phihp_torchrl.trainers import LoggerConfig, make_logger
+from phihp_torchrl.trainers import LoggerConfig, run
+
+from .forked import Forks
+from .run_parts import rows
+from .tally import tally_config
 
 
 def records(path: Path) -> Iterator[bytes]:
@@ -42,25 +47,47 @@ def history(path: Path) -> dict[int, dict[str, str]]:
     return rows
 
 
-@pytest.mark.slow  # the client has a service of its own to start
-def test_the_folder_of_a_resumed_run_has_the_whole_run(tmp_path: Path) -> None:
+KILLED = """
+import os, signal
+from phihp_torchrl.trainers import LoggerConfig, run
+from trainers.run_parts import run_module
+from trainers.tally import register_tally, tally_config
+
+log_unit = run_module._Run._log_unit
+
+def killed(self, *arguments):
+    log_unit(self, *arguments)
+    if self.position.unit == 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+run_module._Run._log_unit = killed
+register_tally()
+run(tally_config(logger=LoggerConfig("wandb", mode="offline")), {path!r})
+"""
+
+
+@pytest.mark.slow  # the client has a service of its own to start, twice
+@pytest.mark.timeout(300)
+@pytest.mark.usefixtures("tally")
+def test_the_folder_of_a_killed_and_resumed_run_has_the_whole_run(
+    tmp_path: Path, forks: Forks
+) -> None:
     """Whatever the folder of the killed session holds, which may be a few bytes."""
     pytest.importorskip("wandb")
-    rows = [
-        {"phase": "model", "unit": str(k), "real_steps": str(30 * k), "loss": "0.5"}
-        for k in range(2)
-    ]
-    config = LoggerConfig("wandb", mode="offline")
-    logger = make_logger(config, {"seed": 0}, tmp_path, run_id="abc12345", resume_unit=2, rows=rows)
-    for unit in (2, 3):
-        logger.log({"phase": "policy", "unit": unit, "real_steps": 60, "loss": 0.25}, unit)
-    logger.close()
-    assert logger.id == "abc12345"
-    (path,) = (tmp_path / "wandb").glob("offline-run-*/*.wandb")
+    place = tmp_path / "run"
+    forks.start(KILLED.format(path=str(place)))
+    assert forks.wait() == -signal.SIGKILL
+    (killed,) = (place / "wandb").glob("offline-run-*/*.wandb")
+    logger = LoggerConfig("wandb", mode="offline")
+    assert run(tally_config(logger=logger), place, resume=True).finished
+    (last,) = set((place / "wandb").glob("offline-run-*/*.wandb")) - {killed}
+    assert last.name == killed.name, "one run, by its identifier"
+    expected = rows(place)
     deadline = time.monotonic() + 30.0  # the client's service may write after it has answered
-    while not (found := history(path)) and time.monotonic() < deadline:
+    while len(found := history(last)) < len(expected) and time.monotonic() < deadline:
         time.sleep(0.2)
-    assert sorted(found) == [0, 1, 2, 3]
-    assert [found[k]["real_steps"] for k in range(4)] == ["0", "30", "60", "60"]
-    assert [float(found[k]["loss"]) for k in range(4)] == [0.5, 0.5, 0.25, 0.25]
-    assert found[0]["phase"] == '"model"'
+    assert sorted(found) == list(range(6))
+    for unit, row in enumerate(expected):
+        assert found[unit]["phase"] == f'"{row["phase"]}"'
+        assert found[unit]["real_steps"] == row["real_steps"]
+        assert float(found[unit]["tally/sum"]) == float(row["tally/sum"])

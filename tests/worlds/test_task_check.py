@@ -59,6 +59,17 @@ class Blind(Pendulum):
         return super().locate(observation) * 0.5
 
 
+class Worn(Pendulum):
+    def prior(self, state, action, constants):
+        return super().prior(state, action.mul_(0.5), constants)
+
+
+class Wrapped(Pendulum):
+    def observe(self, state):
+        state[..., 0].remainder_(0.1)
+        return super().observe(state)
+
+
 class NoConstants(Pendulum):
     def __init__(self, length):
         self.length = length
@@ -80,6 +91,11 @@ class Long(Pendulum):
         (OneState(), "OneState.prior: it failed for tensors of shape [6, 2], [6, 1]: ValueError"),
         (Mixed(), "Mixed.prior: expected the same for a state alone as in a batch, got"),
         (Singular(), "Singular.prior: expected finite numbers, got"),
+        (
+            Worn(),
+            "Worn.prior: expected it to leave what it is given as it is, it changed argument 2",
+        ),
+        (Wrapped(), "Wrapped.observe: expected it to leave what it is given as it is, it changed"),
         (Blind(), "Blind.locate: expected the state that Blind.observe shows"),
         (NoConstants(2.0), "system: expected NoConstants.__init__ to call super().__init__("),
     ],
@@ -125,6 +141,18 @@ def keyed(state, action, next_state):
     return next_state.theta
 
 
+def elsewhere(state, action, next_state):
+    return torch.zeros(state.shape[:-1], device="meta")
+
+
+def spent(state, action, next_state):
+    return next_state.abs_().sum(-1)
+
+
+def clamped(next_state):
+    return next_state.clamp_(-0.1, 0.1)[..., 0] > 0.05
+
+
 def fallen(next_state):
     return (next_state[..., 0].abs() > 1.0).float()
 
@@ -144,6 +172,9 @@ def any_fallen(next_state):
         ({"reward": summed}, "reward, summed: expected float32 of shape [6]"),
         ({"reward": keyed}, "reward, keyed: it failed for tensors of shape [6, 2], [6, 1], [6, 2]"),
         ({"exploration_reward": column}, "exploration_reward, column: expected float32 of shape"),
+        ({"reward": elsewhere}, "reward, elsewhere: expected a tensor on cpu, got one on meta"),
+        ({"reward": spent}, "reward, spent: expected it to leave what it is given as it is"),
+        ({"terminated": clamped}, "terminated, clamped: expected it to leave what it is given"),
         ({"terminated": fallen}, "terminated, fallen: expected bool of shape [6]"),
         ({"terminated": any_fallen}, "terminated, any_fallen: expected the same for a state alone"),
     ],
