@@ -27,12 +27,14 @@ class Finalist:
         chatter: mean change of the action in each, in units of the half-range.
         changes: what it changes in the settings of the planner.
         late: return of each stretch from the second half of the actor's episodes; none by default.
+        weight: how many such stretches an episode has, by which their differences count.
     """
 
     returns: tuple[float, ...]
     chatter: tuple[float, ...]
     changes: Mapping[str, Any] = field(default_factory=dict)
     late: tuple[float, ...] = ()
+    weight: float = 1.0
 
     @property
     def mean_chatter(self) -> float:
@@ -45,10 +47,15 @@ class Finalist:
         return not all(map(math.isfinite, self.returns + self.late))
 
     def ahead_of(self, other: Finalist) -> tuple[float, float]:
-        """Mean paired difference of the returns, late ones added, and its standard error."""
+        """Mean paired difference of an episode's return, and its standard error.
+
+        It is that of :attr:`returns`, and that of the late stretches for each that an episode has.
+        """
         rows = [self.returns, self.late] if self.late else [self.returns]
         against = [other.returns, other.late] if self.late else [other.returns]
-        return estimate(torch.tensor(rows).double() - torch.tensor(against).double())
+        differences = torch.tensor(rows).double() - torch.tensor(against).double()
+        differences[1:] *= self.weight
+        return estimate(differences)
 
     def smoother_than(self, other: Finalist) -> bool:
         """Whether its chatter is clearly less: two thirds at most."""
@@ -88,9 +95,11 @@ def choose(
       than a tenth of the given plan's gain over the actor, or a thousandth of the actor's return.
 
     The plan that is chosen acts if its mean gain over the actor is above one standard error, or if
-    it earns no less and is clearly smoother. Above ``confidence`` standard errors this is certain;
-    so is a gain of exactly zero, where the two do the same and the actor, which is cheaper, acts.
-    All else is doubtful and deserves more episodes before the actor replaces a plan.
+    it earns more on average and is about as smooth, or no less and is clearly smoother. So the one
+    that earns more on average acts, which is the least loss to be expected, except that a gain
+    which may be chance is not bought with chatter. Beyond ``confidence`` standard errors, on
+    either side, this is certain; so is a gain of exactly zero, where the two do the same and the
+    actor, which is cheaper, acts. All else is doubtful and deserves more episodes.
 
     One other plan is compared and not a dozen, because the best of a dozen looks better than it is.
     The one that enters here was picked by other episodes, so its differences here are not favoured
@@ -122,9 +131,21 @@ def choose(
         elif ahead >= -allowed and other.smoother_than(given):
             plan, reason = other, "smoother"
     gain, error = plan.ahead_of(actor)
-    acts = gain > min(confidence, 1.0) * error or (gain >= 0.0 and plan.smoother_than(actor))
-    certain = gain > confidence * error or gain == error == 0.0
+    as_smooth = plan.mean_chatter <= actor.mean_chatter + _NOTICEABLE
+    acts = gain > min(confidence, 1.0) * error or (gain > 0.0 and as_smooth)
+    acts = acts or (gain >= 0.0 and plan.smoother_than(actor))
+    certain = abs(gain) > confidence * error or gain == error == 0.0
     return Choice(plan, reason, "planner" if acts else "actor", certain, gain, error)
+
+
+def late_weight(length: float, steps: int) -> float:
+    """How many stretches of ``steps`` the second half of an episode has, one at least.
+
+    Examples:
+        >>> late_weight(200.0, 20), late_weight(200.0, 150)
+        (5.0, 1.0)
+    """
+    return max(1.0, length / 2 / steps)
 
 
 def estimate(differences: Tensor) -> tuple[float, float]:
