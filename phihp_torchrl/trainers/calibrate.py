@@ -19,7 +19,7 @@ from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_end import End
 from phihp_torchrl.trainers.calibrate_report import report, summary, write_table
-from phihp_torchrl.trainers.calibrate_rule import late_weight
+from phihp_torchrl.trainers.calibrate_rule import late_weight, stretches
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.imagined_play import Played, Player
 from phihp_torchrl.trainers.phases import Phase, register_phase
@@ -211,7 +211,8 @@ class CalibratePhase:
         played = player.play(steps)
         whole = self._steps[-1] + self.config.follow_steps
         gain = player.followed_by(self.actor, whole - steps) - self._of_actor
-        gain[episodes:] *= late_weight(self.end.length, steps)
+        gain = gain.reshape(2, episodes)
+        gain[1] *= late_weight(gain, stretches(self.end.length, steps))
         late = Played(
             played.states,
             played.total[episodes:],
@@ -221,7 +222,7 @@ class CalibratePhase:
         return Trial(
             changes,
             steps,
-            tuple(tuple(row) for row in gain.reshape(2, episodes).tolist()),
+            tuple(tuple(row) for row in gain.tolist()),
             late.chatter(torch.zeros_like(late.lengths)).mean().item(),
         )
 

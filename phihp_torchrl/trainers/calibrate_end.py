@@ -13,7 +13,7 @@ from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.trainers.calibrate_budget import Price, final_steps
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
-from phihp_torchrl.trainers.calibrate_rule import Choice, Finalist, choose, late_weight
+from phihp_torchrl.trainers.calibrate_rule import Choice, Finalist, choose, stretches
 from phihp_torchrl.trainers.imagined_play import Player, followed_by
 
 
@@ -105,7 +105,7 @@ class End:
                 tuple(value for lot in self.lots for value in lot["of"][name][index])
                 for index in range(3)
             )
-            weight = late_weight(self.length, self.steps)
+            weight = stretches(self.length, self.steps)
             found[name] = Finalist(returns, chatter, self.changes.get(name, {}), late, weight)
         return found
 
