@@ -3,6 +3,7 @@
     python benchmarks/paper/calibration.py --tasks pendulum cartpole
     python benchmarks/paper/calibration.py --only-imagine     # without evaluation episodes
     python benchmarks/paper/calibration.py --keep             # play only what is new
+    python benchmarks/paper/calibration.py --episodes 10      # fewer evaluation episodes
     python benchmarks/paper/calibration.py --only-write       # the table of what there is
 
 Reads the agents in results/agents. The choice is made in imagination from seed 0, by the defaults
@@ -45,13 +46,16 @@ def calibrated(agent: Agent) -> dict[str, Any]:
     return {**phase.final, "cpu_seconds": time.process_time() - start}
 
 
-def played(agent: Agent, changes: dict[str, Any], kept: Mapping[str, Any]) -> dict[str, Any]:
+def played(
+    agent: Agent, changes: dict[str, Any], kept: Mapping[str, Any], episodes: int
+) -> dict[str, Any]:
     """Returns and chatter of the planner as given, with ``changes`` and of the actor.
 
     Args:
         agent: the agent.
         changes: what calibration has changed.
         kept: episodes that were played before, by who acts.
+        episodes: number of episodes.
     """
     assert agent.planner_config is not None
     ways = {"given": agent.planner_config, "chosen": replace(agent.planner_config, **changes)}
@@ -64,7 +68,7 @@ def played(agent: Agent, changes: dict[str, Any], kept: Mapping[str, Any]) -> di
             results[name] = kept[name]
             continue
         acting = agent.with_planner(config)
-        found = evaluate(acting, agent.task, episodes=EPISODES, seed=EVALUATION_SEED)
+        found = evaluate(acting, agent.task, episodes=episodes, seed=EVALUATION_SEED)
         assert found.chatter is not None  # the simulated world measures it
         results[name] = {
             "returns": found.returns.tolist(),
@@ -119,6 +123,7 @@ def rows(results: dict[str, dict[str, Any]]) -> tuple[list[list[str]], list[list
             real.append(
                 [
                     task,
+                    str(len(world["given"]["returns"])),
                     *(f"{mean:.1f}" for mean in means),
                     difference(world, acting(found), "given"),
                     difference(world, "chosen", "actor"),
@@ -133,7 +138,7 @@ def write(results: dict[str, dict[str, Any]], not_run: Iterable[str]) -> None:
     imagined, real = rows(results)
     first = ["task", "acts", "settings", "episodes", "gain over the actor"]
     first += ["chatter as given", "chosen", "actor", "CPU s"]
-    second = ["task", "as given", "chosen", "actor", "calibrated less as given"]
+    second = ["task", "episodes", "as given", "chosen", "actor", "calibrated less as given"]
     second += ["chosen less actor", "chatter as given", "chosen", "actor"]
     left = ", ".join(not_run)
     origins = "; ".join(f"{task}, {found['origin']}" for task, found in results.items())
@@ -145,7 +150,7 @@ def write(results: dict[str, dict[str, Any]], not_run: Iterable[str]) -> None:
     )
     if real:
         text += (
-            f"\n## In the simulated world\n\n{EPISODES} evaluation episodes from seed "
+            "\n## In the simulated world\n\nEvaluation episodes from seed "
             f"{EVALUATION_SEED:,}, to report only. Calibrated is whoever acts by the choice.\n\n"
             f"{markdown_table(second, real)}"
         )
@@ -171,6 +176,7 @@ def main() -> None:
     parser.add_argument("--only-imagine", action="store_true", help="play no evaluation episode")
     parser.add_argument("--keep", action="store_true", help="play only what was not played before")
     parser.add_argument("--only-write", action="store_true", help="write the table alone")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="evaluation episodes")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
@@ -182,7 +188,7 @@ def main() -> None:
         print(task, json.dumps(found), flush=True)  # playing may take long
         if not arguments.only_imagine:
             kept = kept_episodes(path, found) if arguments.keep else {}
-            found["world"] = played(agent, found["changes"], kept)
+            found["world"] = played(agent, found["changes"], kept, arguments.episodes)
         path.write_text(json.dumps(found, indent=1) + "\n")
         write_all()
     if arguments.only_write:

@@ -35,6 +35,7 @@ TINY = (
     "evaluate.baselines=none",
     "evaluate.episodes=2",
     "evaluate.latency_actions=3",
+    "calibrate.enabled=false",
     "model.fit.steps=2",
     "model.integrator=semi_implicit_euler",
     "model.collect.planning_horizon=3",

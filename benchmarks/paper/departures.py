@@ -94,6 +94,7 @@ def rerun(task: str, section: str, words: list[str], base: Path, out: Path) -> d
     steps = yaml.safe_load((base / "config.yaml").read_text())["model"]["real_steps"]
     command = [sys.executable, "-m", "phihp_torchrl", "train", f"task={task}", *words, *QUIET]
     command += [f"phases={PHASES[section]}", f"from={base}", f"run_dir={out}"]
+    command += ["calibrate.enabled=false"]  # the planner's settings are those compared
     subprocess.run([*command, f"model.real_steps={steps}"], check=True)
     effects = {}
     for role in ("planner", "actor")[: 1 if section == "planner" else 2]:

@@ -38,7 +38,7 @@ OPERATIONS = ("replace", "rename", "fsync", "mkdir", "unlink", "rmdir")
 UNITS = 3
 """Units of work after which a stopped run stands in its second phase, with checkpoints of it."""
 TINY = {
-    "checkpoint_interval": 0, "compile": False, "progress": False,
+    "checkpoint_interval": 0, "compile": False, "progress": False, "calibrate.enabled": False,
     "model.real_steps": 60, "model.steps_per_iteration": 30, "model.fit.steps": 2,
     "model.integrator": "semi_implicit_euler",
     "model.collect.planning_horizon": 3, "model.collect.replan_every": 2,

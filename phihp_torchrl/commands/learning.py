@@ -77,7 +77,7 @@ def learn(
         >>> tiny |= {"evaluate.episodes": 1, "evaluate.latency_actions": 0, "evaluate.video": False}
         >>> tiny |= {"planner.num_candidates": 8, "planner.top_k": 2, "progress": False}
         >>> tiny |= {"planner.num_policy_candidates": 2, "planner.planning_horizon": 2}
-        >>> tiny |= {"planner.warm_start": False}
+        >>> tiny |= {"planner.warm_start": False, "calibrate.enabled": False}
         >>> with tempfile.TemporaryDirectory() as place:
         ...     agent, path = learn(task, overrides=tiny, run_dir=f"{place}/run")
         ...     (path / "metrics.csv").is_file(), agent.task.name

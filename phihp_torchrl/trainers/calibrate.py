@@ -14,11 +14,12 @@ from torch import Tensor
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.planners import SearchConfig, score_sequences
-from phihp_torchrl.trainers.calibrate_budget import round_episodes, rounds_cost
+from phihp_torchrl.trainers.calibrate_budget import Price, fit_rounds, rounds_cost
 from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_end import End
 from phihp_torchrl.trainers.calibrate_report import report, summary, write_table
+from phihp_torchrl.trainers.calibrate_rule import late_weight, stretches
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.imagined_play import Played, Player
 from phihp_torchrl.trainers.phases import Phase, register_phase
@@ -73,9 +74,10 @@ class CalibratePhase:
         self.settings: list[dict[str, Any]] = []
         self._players: dict[int, Player] = {}
         self._count = len(grid(self.base, 1.0, 1.0))  # of settings, at most
-        self._episodes = round_episodes(config, self.base, self._count)
-        spent = rounds_cost(config, self.base, self._episodes, self._count)
-        self.end = End(agent, config, self.world_model, seed, spent)
+        price = Price.of(agent)
+        self._steps, self._episodes = fit_rounds(config, price, self._count)
+        spent = rounds_cost(config, price, self._steps, self._episodes, self._count)
+        self.end = End(agent, config, self.world_model, seed, price, spent, self._steps[-1])
 
     @property
     def done(self) -> bool:
@@ -105,7 +107,7 @@ class CalibratePhase:
         """Try the next setting, or let the finalists play some episodes."""
         if not self.settings:
             self._prepare()
-        for index, steps in enumerate(self.config.rounds):
+        for index, steps in enumerate(self._steps):
             contenders = self._contenders(index)
             done = len(self.rounds[index])
             if done < len(contenders):
@@ -162,7 +164,8 @@ class CalibratePhase:
         self._starts = torch.cat([starts[1], late[0, :episodes]])
         self.end.starts, self.end.late = starts[2], late[0, episodes:]
         late = late[:, :episodes]
-        steps = self.config.rounds[-1] + self.config.follow_steps
+        self.end.length = played.lengths.double().mean().item()
+        steps = self._steps[-1] + self.config.follow_steps
         self._of_actor = Player(self.actor, self.world_model, self._starts).play(steps).total
         reward = (played.total / played.lengths).abs().mean().item()
         self.settings = grid(self.base, self._promise(late.flatten(0, 1)), reward)
@@ -206,8 +209,10 @@ class CalibratePhase:
             self._players[number] = Player(agent, self.world_model, self._starts, self.seed)
         player = self._players[number]
         played = player.play(steps)
-        whole = self.config.rounds[-1] + self.config.follow_steps
+        whole = self._steps[-1] + self.config.follow_steps
         gain = player.followed_by(self.actor, whole - steps) - self._of_actor
+        gain = gain.reshape(2, episodes)
+        gain[1] *= late_weight(gain, stretches(self.end.length, steps))
         late = Played(
             played.states,
             played.total[episodes:],
@@ -217,7 +222,7 @@ class CalibratePhase:
         return Trial(
             changes,
             steps,
-            tuple(tuple(row) for row in gain.reshape(2, episodes).tolist()),
+            tuple(tuple(row) for row in gain.tolist()),
             late.chatter(torch.zeros_like(late.lengths)).mean().item(),
         )
 

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.trainers.calibrate_budget import final_steps, plan_cost
+from phihp_torchrl.trainers.calibrate_budget import Price, final_steps
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
-from phihp_torchrl.trainers.calibrate_rule import Choice, Finalist, choose
-from phihp_torchrl.trainers.imagined_play import Played, Player
+from phihp_torchrl.trainers.calibrate_rule import Choice, Finalist, choose, stretches
+from phihp_torchrl.trainers.imagined_play import Player, followed_by
 
 
 class End:
@@ -25,13 +25,17 @@ class End:
         config: settings of calibration.
         world_model: the model to imagine with.
         seed: seed of the noise of plans.
+        price: of a plan.
         spent: what the rounds before have used of the budget.
+        least: planned steps of an episode at least.
     """
 
     starts: Tensor
     """First states, ``[config.max_episodes, n]``."""
     late: Tensor
     """States in the second half of the actor's episodes, of the same shape."""
+    length: float
+    """Mean number of steps of the actor's episodes."""
 
     def __init__(
         self,
@@ -39,13 +43,16 @@ class End:
         config: CalibrateConfig,
         world_model: TaskWorldModel,
         seed: int,
+        price: Price,
         spent: float,
+        least: int,
     ) -> None:
         assert agent.planner_config is not None
         self.agent, self.config, self.world_model = agent, config, world_model
         self.actor, self.base = agent.actor_alone(), agent.planner_config
         self.seed, self.spent, self.longest = seed, spent, agent.task.max_steps
-        self.steps = final_steps(config, self.base, config.budget - spent, self.longest)
+        self.price = price
+        self.steps = final_steps(config, price, config.budget - spent, least, self.longest)
         self.changes: dict[str, dict[str, Any]] = {}
         self.lots: list[dict[str, Any]] = []
 
@@ -64,7 +71,7 @@ class End:
         if not self.next_episodes:
             return False
         plans, steps = len(self.changes), max(lot["steps"] for lot in self.lots)
-        following = plans * steps * plan_cost(self.base, 2 * self.next_episodes)
+        following = plans * steps * self.price.plan(2 * self.next_episodes)
         spent = self.spent + sum(lot["cost"] for lot in self.lots)
         return spent + following <= self.config.budget
 
@@ -73,24 +80,22 @@ class End:
         first, count = self.episodes, self.next_episodes
         lot, seed = slice(first, first + count), self.seed + first
         starts = torch.cat([self.starts[lot], self.late[lot]])
-        of, cost, longest = {}, 0.0, 0
-        for name, changes in self.changes.items():
-            agent = self.agent.with_planner(replace(self.base, **changes))
-            player = Player(agent, self.world_model, starts, seed)
-            played = player.play(self.steps)
-            of[name] = self._found(player, played, count)
-            longest = max(longest, len(played.changes))
-            cost += len(played.changes) * plan_cost(self.base, 2 * count)
-        player = Player(self.actor, self.world_model, starts)
-        of["actor"] = self._found(player, player.play(self.steps), count)
-        plain = {name: [row.tolist() for row in rows] for name, rows in of.items()}
-        self.lots.append({"episodes": count, "steps": longest, "cost": cost, "of": plain})
-
-    def _found(self, player: Player, played: Played, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Returns of episodes, chatter late in them, and returns of the late stretches."""
-        total = player.followed_by(self.actor, self.longest - self.steps)
-        chatter = played.chatter(played.lengths // 2)
-        return total[:count], chatter[count:], total[count:]
+        players, cost, longest = {}, 0.0, 0
+        for name, changes in {**self.changes, "actor": None}.items():
+            config = None if changes is None else replace(self.base, **changes)
+            agent = self.agent.with_planner(config)
+            players[name] = Player(agent, self.world_model, starts, seed)
+            steps = len(players[name].play(self.steps).changes)
+            if changes is not None:
+                longest = max(longest, steps)
+                cost += steps * self.price.plan(2 * count)
+        totals = followed_by(self.actor, list(players.values()), self.longest - self.steps)
+        of = {}
+        for (name, player), total in zip(players.items(), totals, strict=True):
+            played = player.play(self.steps)  # no more than has been played
+            chatter = played.chatter(torch.zeros_like(played.lengths))
+            of[name] = [row.tolist() for row in (total[:count], chatter[count:], total[count:])]
+        self.lots.append({"episodes": count, "steps": longest, "cost": cost, "of": of})
 
     def finalists(self) -> dict[str, Finalist]:
         """What each has earned in all lots."""
@@ -100,7 +105,8 @@ class End:
                 tuple(value for lot in self.lots for value in lot["of"][name][index])
                 for index in range(3)
             )
-            found[name] = Finalist(returns, chatter, self.changes.get(name, {}), late)
+            weight = stretches(self.length, self.steps)
+            found[name] = Finalist(returns, chatter, self.changes.get(name, {}), late, weight)
         return found
 
     def choice(self) -> Choice:

@@ -27,12 +27,14 @@ class Finalist:
         chatter: mean change of the action in each, in units of the half-range.
         changes: what it changes in the settings of the planner.
         late: return of each stretch from the second half of the actor's episodes; none by default.
+        weight: how many such stretches an episode has, as often as their differences count at most.
     """
 
     returns: tuple[float, ...]
     chatter: tuple[float, ...]
     changes: Mapping[str, Any] = field(default_factory=dict)
     late: tuple[float, ...] = ()
+    weight: float = 1.0
 
     @property
     def mean_chatter(self) -> float:
@@ -45,10 +47,16 @@ class Finalist:
         return not all(map(math.isfinite, self.returns + self.late))
 
     def ahead_of(self, other: Finalist) -> tuple[float, float]:
-        """Mean paired difference of the returns, late ones added, and its standard error."""
+        """Mean paired difference of an episode's return, and its standard error.
+
+        It is that of :attr:`returns`, and that of late stretches times :func:`late_weight`.
+        """
         rows = [self.returns, self.late] if self.late else [self.returns]
         against = [other.returns, other.late] if self.late else [other.returns]
-        return estimate(torch.tensor(rows).double() - torch.tensor(against).double())
+        differences = torch.tensor(rows).double() - torch.tensor(against).double()
+        if self.late:
+            differences[1] *= late_weight(differences, self.weight)
+        return estimate(differences)
 
     def smoother_than(self, other: Finalist) -> bool:
         """Whether its chatter is clearly less: two thirds at most."""
@@ -87,10 +95,11 @@ def choose(
     - is clearly smoother, with at most two thirds of the chatter, and does not earn less by more
       than a tenth of the given plan's gain over the actor, or a thousandth of the actor's return.
 
-    The plan that is chosen acts if its mean gain over the actor is above one standard error, or if
-    it earns no less and is clearly smoother. Above ``confidence`` standard errors this is certain;
-    so is a gain of exactly zero, where the two do the same and the actor, which is cheaper, acts.
-    All else is doubtful and deserves more episodes before the actor replaces a plan.
+    The plan that is chosen acts unless the actor earns more by over one standard error: a plan
+    looks further than its actor and is compared with it at every step, so what is in doubt is more
+    likely a gain. Beyond ``confidence`` standard errors, on either side, the choice is certain;
+    all else is doubtful and deserves more episodes. Where both earn exactly the same in each, the
+    actor, which is cheaper, acts, unless the plan is clearly smoother.
 
     One other plan is compared and not a dozen, because the best of a dozen looks better than it is.
     The one that enters here was picked by other episodes, so its differences here are not favoured
@@ -122,9 +131,39 @@ def choose(
         elif ahead >= -allowed and other.smoother_than(given):
             plan, reason = other, "smoother"
     gain, error = plan.ahead_of(actor)
-    acts = gain > min(confidence, 1.0) * error or (gain >= 0.0 and plan.smoother_than(actor))
-    certain = gain > confidence * error or gain == error == 0.0
+    acts = gain > -min(confidence, 1.0) * error or (gain >= 0.0 and plan.smoother_than(actor))
+    certain = abs(gain) > confidence * error or gain == error == 0.0
     return Choice(plan, reason, "planner" if acts else "actor", certain, gain, error)
+
+
+def stretches(length: float, steps: int) -> float:
+    """How many stretches of ``steps`` the second half of an episode has, one at least.
+
+    Examples:
+        >>> stretches(200.0, 20), stretches(200.0, 150)
+        (5.0, 1.0)
+    """
+    return max(1.0, length / 2 / steps)
+
+
+def late_weight(differences: Tensor, most: float) -> float:
+    """How often late differences count: ``most``, if their noise then is not above the others'.
+
+    Where a balance is held, a late stretch has next to no noise and tells what a plan gains or
+    spoils by and by. Where episodes end at a goal, it would drown the rest.
+
+    Args:
+        differences: from the task's starts, and of late stretches, ``[2, episodes]``.
+        most: how many such stretches an episode has.
+
+    Examples:
+        >>> late_weight(torch.tensor([[0.0, 4.0], [0.0, 1.0]]), 10.0)
+        4.0
+    """
+    own, late = differences.std(-1).tolist()
+    if not math.isfinite(own + late) or late * most <= own:
+        return most
+    return max(1.0, own / late)
 
 
 def estimate(differences: Tensor) -> tuple[float, float]:

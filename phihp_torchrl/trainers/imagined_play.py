@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -93,6 +94,15 @@ class Player:
 
     def followed_by(self, actor: Agent, steps: int) -> Tensor:
         """Returns ``[N]`` if ``actor`` plays ``steps`` steps after what has been played."""
-        rest = Player(actor, self.world_model, self._states[-1])
-        rest._alive = self._alive
-        return self._total + (rest.play(steps).total if steps else 0.0)
+        return followed_by(actor, [self], steps)[0]
+
+
+def followed_by(actor: Agent, players: Sequence[Player], steps: int) -> list[Tensor]:
+    """Returns ``[N]`` of each if ``actor`` plays on for ``steps`` steps, all at once."""
+    rest = Player(actor, players[0].world_model, torch.cat([each._states[-1] for each in players]))
+    rest._alive = torch.cat([each._alive for each in players])
+    totals = [each._total for each in players]
+    if not steps:
+        return totals
+    more = rest.play(steps).total.split([len(total) for total in totals])
+    return [total + extra for total, extra in zip(totals, more, strict=True)]

@@ -49,6 +49,7 @@ TINY = {
     "planner.top_k": 2,
     "planner.planning_horizon": 2,
     "planner.num_kept_elites": 0,
+    "calibrate.enabled": False,
     "evaluate.episodes": 1,
     "evaluate.latency_actions": 0,
     "evaluate.baselines": "none",

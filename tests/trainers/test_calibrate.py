@@ -10,13 +10,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, save_agent
+from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, load_config, save_agent
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
-from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, run
-from phihp_torchrl.trainers.calibrate_budget import final_steps
+from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, read_run_config, run
+from phihp_torchrl.trainers.calibrate_budget import Price, final_steps, fit_rounds
 from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
+from phihp_torchrl.trainers.calibrate_rule import late_weight
 
 from .run_parts import CONFIG, with_sections
 
@@ -166,7 +167,7 @@ def test_in_doubt_more_episodes_are_played_up_to_the_limit(caplog):
     assert phase.final["certain"] is False
     assert "Raise calibrate.max_episodes" in caplog.text
     gain, error = phase.final["gain"], phase.final["gain_error"]
-    assert (phase.acting == "planner") == (gain > error)
+    assert (phase.acting == "planner") == (gain > -error)
     # The lots are from different starts.
     assert len(set(phase.end.finalists()["actor"].returns)) == TINY.max_episodes
 
@@ -174,10 +175,35 @@ def test_in_doubt_more_episodes_are_played_up_to_the_limit(caplog):
 def test_the_budget_ends_doubt_and_shortens_plans():
     small = finished(make_agent(), replace(TINY, confidence=1e6, budget=100_000))
     assert small.final["episodes"] == TINY.episodes
-    assert small.final["steps"] == TINY.rounds[-1]
-    assert final_steps(TINY, SMALL, rest=1e9, longest=20) == 20  # the whole episode
-    # Two plans, three calls each, of six rows with 32 candidates, from half of what is left.
-    assert final_steps(TINY, SMALL, rest=2 * 8 * 2 * 3 * (1000 + 192), longest=20) == 8
+    assert small.final["steps"] == small._steps[-1]
+
+
+def test_the_first_episodes_at_the_end_take_a_quarter_of_what_is_left():
+    price = Price(SMALL)
+    step = 2 * price.plan(2 * TINY.episodes)  # two plans, from two sorts of starts
+    assert step == 2 * 3 * (1000 + 6 * 32)
+
+    def steps(paid):
+        return final_steps(TINY, price, rest=paid * step, least=3, longest=100)
+
+    assert [steps(paid) for paid in (1e6, 200, 80, 40, 10, 0)] == [100, 50, 20, 16, 10, 3]
+
+
+def test_dear_plans_have_fewer_episodes_and_then_fewer_steps():
+    steps, episodes = fit_rounds(TINY, Price(SMALL), 9)
+    assert (steps, episodes) == (TINY.rounds, TINY.episodes)
+    dear = Price(SMALL, actor=1e4)
+    steps, episodes = fit_rounds(replace(TINY, episodes=6), dear, 9)
+    assert episodes == 3
+    assert list(steps) == sorted(set(steps))
+    assert steps[-1] < TINY.rounds[-1]
+
+
+def test_larger_networks_make_plans_dearer():
+    narrow = Price.of(make_agent())
+    assert narrow.critics == 0.0  # it has none
+    assert narrow.actor > 1.0
+    assert narrow.plan(6) > Price(SMALL).plan(6)
 
 
 def test_late_stretches_count_and_chatter_is_theirs():
@@ -187,12 +213,20 @@ def test_late_stretches_count_and_chatter_is_theirs():
     for way in of.values():
         assert len(way.returns) == len(way.late) == len(way.chatter) == phase.end.episodes
     gains = [
-        ours - theirs
+        [
+            ours - theirs
+            for ours, theirs in zip(
+                getattr(of["given"], rows), getattr(of["actor"], rows), strict=True
+            )
+        ]
         for rows in ("returns", "late")
-        for ours, theirs in zip(getattr(of["given"], rows), getattr(of["actor"], rows), strict=True)
     ]
+    weight = late_weight(torch.tensor(gains), of["given"].weight)
+    assert 1.0 <= weight <= of["given"].weight
     ahead, error = of["given"].ahead_of(of["actor"])
-    assert ahead == pytest.approx(sum(gains) / phase.end.episodes, rel=1e-4)
+    assert ahead == pytest.approx(
+        (sum(gains[0]) + weight * sum(gains[1])) / phase.end.episodes, rel=1e-4
+    )
     assert error > 0
 
 
@@ -213,6 +247,7 @@ def test_the_file_says_how_the_agent_acts(tmp_path, acting):
 
 @pytest.mark.slow
 def test_a_run_calibrates_before_it_evaluates(tmp_path):
+    assert read_run_config(load_config("pendulum")).section("calibrate").enabled
     config = with_sections(CONFIG, calibrate=TINY)
     result = run(config, tmp_path / "run")
     table = json.loads((tmp_path / "run" / "calibration.json").read_text())

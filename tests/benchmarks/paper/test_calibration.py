@@ -50,6 +50,6 @@ def test_the_tables_pair_the_episodes_and_name_what_was_not_run(
     cells = [line for line in lines if line[0] == "pendulum"]
     assert cells[0][1:5] == ["actor, in doubt", "alpha=0.5 (smoother)", "48", "+1.00 ± 2.00"]
     # The actor acts, so the calibrated agent's episodes are the actor's.
-    assert cells[1][1:6] == ["1.5", "4.5", "3.0", "+1.50 ± 0.50", "+1.50 ± 0.50"]
+    assert cells[1][1:7] == ["2", "1.5", "4.5", "3.0", "+1.50 ± 0.50", "+1.50 ± 0.50"]
     text = (place / "README.md").read_text()
     assert "Not run: pendulum-swingup, cartpole" in text
