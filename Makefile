@@ -14,6 +14,8 @@ DOCS_STAMP := $(VENV)/.installed-docs
 # One intra-op thread: two threads on two busy cores are many times slower, not faster.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 HEADLESS := SDL_VIDEODRIVER=dummy MPLBACKEND=Agg WANDB_MODE=disabled
+# Whatever the shell says: each of the processes of the tests would compile all modules anew.
+KEEP_BYTECODE := PYTHONDONTWRITEBYTECODE=
 
 .PHONY: help demo test lint format types config docs bench lock clean
 
@@ -28,7 +30,7 @@ demo: $(STAMP) ## learn PendulumSwingup and watch it swing up
 	$(ONE_THREAD) $(BIN)/python recipes/demo.py $(ARGS)
 
 test: $(STAMP) ## run the tests (ARGS="-m 'not slow'" for the quick ones)
-	$(ONE_THREAD) $(HEADLESS) $(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
+	$(ONE_THREAD) $(HEADLESS) $(KEEP_BYTECODE) $(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
 lint: $(STAMP) ## ruff (lint and format) and mypy, changing nothing
 	$(BIN)/ruff check .

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import pickle
 import random
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from forked import Forks
+from hydra._internal.core_plugins.importlib_resources_config_source import (
+    ImportlibResourcesConfigSource,
+)
 from hypothesis import settings
 from matplotlib.figure import Figure
 
@@ -49,6 +55,36 @@ def _undrawn() -> Iterator[None]:
         for module in _drawing():
             patch.setattr(module, "episode_figure", lambda *_, **__: Figure(figsize=(1, 1)))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _parsed_once() -> Iterator[None]:
+    """A YAML file of a package is parsed once, not by each of the hundreds of compositions.
+
+    That is half of the time of one. Every reader gets an object of its own.
+    """
+    parsed: dict[tuple[str, ...], bytes] = {}
+    read = ImportlibResourcesConfigSource._read_config
+
+    def read_again(self: ImportlibResourcesConfigSource, file: Any) -> Any:
+        if not isinstance(file, Path):  # in an archive
+            return read(self, file)
+        key = (self.provider, self.path, str(file), str(file.stat().st_mtime_ns))
+        if key not in parsed:
+            parsed[key] = pickle.dumps(read(self, file))
+        return pickle.loads(parsed[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ImportlibResourcesConfigSource, "_read_config", read_again)
+        yield
+
+
+@pytest.fixture(scope="session")
+def forks() -> Iterator[Forks]:
+    """Starts processes, for which the package is imported once."""
+    found = Forks()
+    yield found
+    found.close()
 
 
 @pytest.fixture

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from phihp_torchrl.evaluation.episode import Episode
 from phihp_torchrl.evaluation.predicted import Predictions
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Curve = Mapping[str, Sequence[tuple[int, float]]]
 """Returns over real steps: points by what earned them."""
@@ -39,6 +42,8 @@ def episode_figure(
         >>> [panel.get_ylabel() for panel in figure.axes]
         ['theta', 'theta_dot', 'torque', 'reward']
     """
+    from matplotlib.figure import Figure  # here, for most processes draw nothing
+
     task, system = episode.task, episode.task.system
     panels = len(system.state_names) + len(system.action_names) + 1
     figure = Figure(figsize=(7.0, 0.6 + 1.1 * panels + 1.6 * bool(curve)), layout="constrained")

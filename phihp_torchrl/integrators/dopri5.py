@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torchdiffeq import odeint
 
 from phihp_torchrl.config import check_positive
 from phihp_torchrl.integrators.base import Derivative, Integrator, StateLayout, TimeStep
@@ -50,6 +49,8 @@ class Dopri5(Integrator):
     def __call__(
         self, derivative: Derivative, state: Tensor, time_step: TimeStep, layout: StateLayout
     ) -> Tensor:
+        from torchdiffeq import odeint  # here, for it imports much of SciPy, and few solve by it
+
         # Time steps that differ are brought to the same unit interval by the speed of the motion.
         length, speed = (1.0, time_step) if isinstance(time_step, Tensor) else (time_step, 1.0)
         times = torch.tensor([0.0, length], dtype=state.dtype, device=state.device)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
 import torch
+from forked import Forks
 
 from phihp_torchrl import Agent, evaluate, get_task, load_agent, save_agent
 from phihp_torchrl.agents import Actor
@@ -139,7 +138,7 @@ def test_it_is_exported_or_says_why_not(name):
         assert error.value.key == "agent"
 
 
-def test_a_kind_with_a_folder_of_its_own_is_found_there(tmp_path):
+def test_a_kind_with_a_folder_of_its_own_is_found_there(tmp_path, forks: Forks):
     """Another process that knows nothing of TD-MPC loads its agents all the same."""
     agent = td_mpc()
     save_agent(agent, tmp_path)
@@ -148,8 +147,8 @@ def test_a_kind_with_a_folder_of_its_own_is_found_there(tmp_path):
         "assert 'phihp_torchrl.tdmpc' not in sys.modules; "
         f"agent = load_agent({str(tmp_path)!r}); print(type(agent).__name__, agent.kind)"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["TDMPCAgent", "td-mpc"]
+    forks.start(code)
+    assert forks.end() == (["TDMPCAgent td-mpc"], 0)
 
 
 # A kind of a user's.

@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium
 import pytest
-from brief import shorten
+from brief import STEPS, shorten
 
 import phihp_torchrl
 import phihp_torchrl.tdmpc  # its phase and agent stay registered
@@ -26,6 +27,7 @@ from tests.docs.blocks import ROOT, write_titled
 
 TINY = {
     "model.real_steps": 50,
+    "model.integrator": "semi_implicit_euler",  # the choice of one fits five, and has tests
     "model.fit.steps": 2,
     "model.collect.planning_horizon": 3,
     "model.collect.num_candidates": 8,
@@ -91,7 +93,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs are short, and windows do not wait for the clock on the wall."""
+    """Runs and episodes are short, and windows do not wait for the clock on the wall."""
 
     def learn_little(*arguments, overrides=(), **options):
         lines = [*override_lines(overrides), *override_lines(TINY)]
@@ -99,6 +101,11 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
             shorten(patch)
             return learn(*arguments, overrides=lines, **options)
 
+    def make_brief(*arguments, **options):
+        return gymnasium.wrappers.TimeLimit(make(*arguments, **options), STEPS)
+
+    make = gymnasium.make
+    monkeypatch.setattr(gymnasium, "make", make_brief)
     monkeypatch.setattr(phihp_torchrl, "learn", learn_little, raising=False)
     pygame = pytest.importorskip("pygame")
     monkeypatch.setattr(pygame.time, "Clock", lambda: SimpleNamespace(tick=lambda rate: None))

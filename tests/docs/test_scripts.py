@@ -19,7 +19,7 @@ EXPECTED = {
 RUN = """
 import multiprocessing.context as contexts, runpy, sys
 forked = contexts._concrete_contexts["forkserver"]
-forked.set_forkserver_preload(["torchrl.collectors", "phihp_torchrl.planners", "seeds"])
+forked.set_forkserver_preload(["torchrl.collectors", "phihp_torchrl.worlds", "seeds"])
 contexts._concrete_contexts["spawn"] = forked
 for script in sys.argv[1:]:
     runpy.run_path(script, run_name="__main__")

@@ -1,8 +1,7 @@
-"""What tests of runs share: one that nothing disturbed, processes, and the smallest method."""
+"""What tests of runs share: one that nothing disturbed, and the smallest method."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,6 @@ import pytest
 from phihp_torchrl.config import METHODS, choices
 from phihp_torchrl.trainers import PHASES, run
 
-from .forked import Forks
 from .run_parts import CONFIG
 from .tally import register_tally
 
@@ -21,14 +19,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("runs") / "whole"
     assert run(CONFIG, path).finished
     return path
-
-
-@pytest.fixture(scope="session")
-def forks() -> Iterator[Forks]:
-    """Starts processes."""
-    found = Forks()
-    yield found
-    found.close()
 
 
 @pytest.fixture

@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 import torch
+from forked import Forks
 from torchrl.checkpoint import CheckpointError
 
 from phihp_torchrl.trainers import run
 from phihp_torchrl.trainers.checkpoints import load_state, save_state
 from phihp_torchrl.trainers.interrupt import Interrupt
 
-from .forked import Forks
 from .run_parts import CONFIG, UNITS, Crash, assert_same_run, rows, run_module
 
 KILLS = {

@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 import torch
+from forked import Forks
 
 from phihp_torchrl.trainers import ModelTrainer, PolicyTrainer, run
 from phihp_torchrl.trainers.evaluate import EvaluatePhase
 from phihp_torchrl.trainers.interrupt import Abandoned, Interrupt
 from phihp_torchrl.trainers.keeper import Keeper
 
-from .forked import Forks
 from .run_parts import CONFIG, assert_same_run, rows, run_module
 
 RARELY = replace(CONFIG, checkpoint_interval=1000.0)

@@ -13,7 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from grid_cells import PAPER, ROOT, TINY, do, returns, words
+from forked import Forks
+from grid_cells import PAPER, TINY, do, returns, words
 
 from grid import GridConfig, Status, claim, is_claimed, keep, look, work
 from grid.display import failures
@@ -22,11 +23,13 @@ from phihp_torchrl.config import ConfigError
 from report import read_run
 
 BRIEF_SCRIPT = """
-import runpy, sys
+import os, runpy, sys
 from pytest import MonkeyPatch
 from brief import shorten
 shorten(MonkeyPatch())
-sys.argv = sys.argv[1:]
+os.chdir({place!r})
+os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+sys.argv = {words!r}
 sys.path.insert(0, sys.argv[0].rpartition("/")[0])
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
@@ -195,15 +198,12 @@ def test_a_claim_ends_with_its_process(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
-    config: GridConfig, whole: GridConfig, tmp_path: Path
+    config: GridConfig, whole: GridConfig, tmp_path: Path, forks: Forks
 ) -> None:
     # Long enough to be caught in the middle: a checkpoint after every unit, and slow evaluations.
     overrides = [*TINY, "checkpoint_interval=0"]
     quoted = ",".join(f'"{override}"' for override in overrides)
     command = [
-        sys.executable,
-        "-c",
-        BRIEF_SCRIPT,
         str(PAPER / "run_grid.py"),
         "task=pendulum",
         "share=0.03",
@@ -211,17 +211,14 @@ def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
     ]
     command += [f"runs={config.runs}", f"results={config.results}", f"overrides=[{quoted}]"]
     metrics = config.files(Path()).run / "metrics.csv"
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    environment = {**os.environ, "PYTHONPATH": paths}
-    with subprocess.Popen(
-        command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL
-    ) as process:
-        deadline = time.monotonic() + 120
-        while time.monotonic() < deadline and process.poll() is None:
-            if metrics.exists() and len(metrics.read_text().splitlines()) > 2:
-                break
-            time.sleep(0.001)
-        process.send_signal(signal.SIGKILL)
+    process = forks.start(BRIEF_SCRIPT.format(place=str(tmp_path), words=command))
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if metrics.exists() and len(metrics.read_text().splitlines()) > 2:
+            break
+        time.sleep(0.001)
+    os.kill(process, signal.SIGKILL)
+    assert forks.wait() == -signal.SIGKILL
     assert look(config.files(Path())).status is Status.STOPPED
     assert do(replace(config, claim_wait=10.0)).status is Status.DONE
     assert words(config) == ["started", "resumed", "finished"]

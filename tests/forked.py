@@ -12,7 +12,7 @@ from pathlib import Path
 
 SERVER = """
 import json, os, sys
-sys.path.insert(0, {tests!r})
+sys.path[:0] = [{tests!r}, {root!r}]
 import phihp_torchrl.commands
 import trainers.run_parts
 
@@ -30,7 +30,8 @@ class Forks:
     """Starts scripts one after the other, each in a process that nothing else has run in."""
 
     def __init__(self) -> None:
-        script = SERVER.format(tests=str(Path(__file__).parents[1]))
+        tests = Path(__file__).parent
+        script = SERVER.format(tests=str(tests), root=str(tests.parent))
         self.server = subprocess.Popen(
             [sys.executable, "-c", script],
             stdin=subprocess.PIPE,
@@ -52,9 +53,15 @@ class Forks:
 
     def wait(self) -> int:
         """How the script ended: its exit code, or less than zero the signal that killed it."""
+        return self.end()[1]
+
+    def end(self) -> tuple[list[str], int]:
+        """What else the script prints, by lines, and how it ends."""
+        lines: list[str] = []
         while not (line := self.line()).startswith("ended by "):
             assert self.server.poll() is None
-        return int(line.split()[-1])
+            lines.append(line)
+        return lines, int(line.split()[-1])
 
     def close(self) -> None:
         self.server.communicate()
