@@ -11,7 +11,7 @@ import pytest
 
 from phihp_torchrl.trainers import LoggerConfig, run
 
-from .forked import Forks
+from forked import Forks
 from .run_parts import rows
 from .tally import tally_config
 
