@@ -7,7 +7,10 @@ from dataclasses import replace
 
 import torch
 
-from phihp_torchrl.identification.choose_integrator import choose_integrator
+from phihp_torchrl.identification.choose_integrator import (
+    choose_delay_and_integrator,
+    choose_integrator,
+)
 from phihp_torchrl.identification.config import AUTO, IdentifyConfig
 from phihp_torchrl.identification.each_action import (
     delay_each,
@@ -57,22 +60,43 @@ class Chooser:
         self.tried = [self.best]
 
     def choose_all(self) -> None:
-        """Delay, lag, the other parts, and the integrator, in this order.
+        """Delay, lag, the other parts, and the integrator with its substeps, in this order.
 
         Where several actions move, each may have its own delay and lag. Unequal gains or a dead
-        zone hide what is under way, so delay and lag are chosen anew behind such parts.
+        zone hide what is under way, so delay and lag are chosen anew behind such parts. A wrong
+        integrator hides it too at long steps: delays are tried behind either, and where the other
+        one is chosen in the end, all is chosen anew behind that.
         """
-        self.choose_path()
+        first = self.best
+        choose_delay_and_integrator(self)
+        taken = self.best.model.integrator
+        self._choose_after_delay()
+        choose_integrator(self)
+        found = self.best
+        if found.model.integrator.name == taken.name:
+            return
+        model = replace(first.model, integrator=found.model.integrator)
+        self.best = self.consider(f"{first.part}, {model.integrator.name}", model, found)
+        self.choose_delay()
+        self._choose_after_delay()
+        if self.trials.better(found, self.best):
+            self.best = found
+
+    def _choose_after_delay(self) -> None:
+        """All that a drive may do beside a common delay."""
+        self._choose_path_after_delay()
         self.choose_slew()
         before = self.best
         promising = self.choose_parts()
         if promising is not before:
             choose_again(self, promising)
-        choose_integrator(self)
 
     def choose_path(self) -> None:
         """Delay and lag, of all actions together and then of each."""
         self.choose_delay()
+        self._choose_path_after_delay()
+
+    def _choose_path_after_delay(self) -> None:
         moving = self.moving()
         if len(moving) > 1 and self.config.delay == AUTO:
             delay_each(self, moving)

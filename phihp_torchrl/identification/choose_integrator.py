@@ -13,6 +13,25 @@ if TYPE_CHECKING:
     from phihp_torchrl.identification.choices import Chooser
 
 
+def choose_delay_and_integrator(chooser: Chooser) -> None:
+    """A common delay behind Runge-Kutta's steps, or behind Euler's where those are clearly better.
+
+    A step of Euler's acts half a step earlier than the motion that it stands for, so a delay that
+    is sought behind the wrong one of the two is found wrong by as much.
+    """
+    first = chooser.best
+    chooser.choose_delay()
+    if chooser.config.integrator != AUTO:
+        return
+    found = chooser.best
+    euler = make_integrator("semi_implicit_euler", substeps=chooser.config.substeps or 1)
+    model = replace(first.model, integrator=euler)
+    chooser.best = chooser.consider(f"{first.part}, {euler.name}", model, first)
+    chooser.choose_delay()
+    if not chooser.trials.better(chooser.best, found):
+        chooser.best = found
+
+
 def choose_integrator(chooser: Chooser) -> None:
     """Runge-Kutta with as few substeps as do; a step of Euler's where the data were made so."""
     config = chooser.config

@@ -231,19 +231,42 @@ def test_recordings_that_do_not_fit_are_refused() -> None:
         identify(task, [log], IdentifyConfig(stops={"y": (0.0, 1.0)}))
 
 
-def test_a_rig_that_was_simulated_by_eulers_steps_is_integrated_so() -> None:
+def by_eulers_steps(samples: int, step: float, delay: int = 0, noise: float = 0.0) -> Recording:
+    """The mass, stepped by Euler's method, whose commands act so many samples late."""
+    generator = torch.Generator().manual_seed(0)
     state, states = torch.tensor([0.3, 0.0]).double(), []
-    command = (5.0 * torch.sin(torch.arange(400) ** 1.5 / 40.0)).double()[:, None]
+    command = 10.0 * torch.rand(samples, generator=generator).double() - 5.0
+    command = command.repeat_interleave(3)[:samples, None]
     truth, layout = Mass().with_constants(MASS), Mass().layout()
     solver = make_integrator("semi_implicit_euler")
-    for u in command:
+    for k in range(samples):
         states.append(state)
-        state = solver(lambda s, u=u: truth.prior(s, u, truth.constants), state, 0.05, layout)
-    log = Recording(0.05 * torch.arange(400), torch.stack(states), command)
+        u = command[max(0, k - delay)]
+        state = solver(lambda s, u=u: truth.prior(s, u, truth.constants), state, step, layout)
+    seen = torch.stack(states)
+    seen = seen + noise * torch.randn(seen.shape, generator=generator)
+    return Recording(step * torch.arange(samples), seen, command)
+
+
+def test_a_rig_that_was_simulated_by_eulers_steps_is_integrated_so() -> None:
     settings = {**PLAIN, "integrator": "auto", "substeps": 0}
-    found = identify(make_task(Mass(), step=0.05), [log], IdentifyConfig(**settings))
+    task, log = make_task(Mass(), step=0.05), by_eulers_steps(400, 0.05)
+    found = identify(task, [log], IdentifyConfig(**settings))
     assert found.settings["integrator"] == "semi_implicit_euler"
     assert found.constants["stiffness"].estimate == pytest.approx(MASS["stiffness"], rel=1e-3)
+
+
+def test_a_delay_behind_eulers_steps_is_exact() -> None:
+    """Behind Runge-Kutta's steps it would look like half a step more or less."""
+    log = by_eulers_steps(1000, 0.2, delay=1, noise=0.003)
+    found = identify(make_task(Mass(), step=0.2), [log])
+    assert found.settings["integrator"] == "semi_implicit_euler"
+    assert found.actuator.actuator is not None
+    assert found.actuator.actuator.delay_steps == 1.0
+    for name, value in MASS.items():
+        each = found.constants[name]
+        assert each.low <= value <= each.high
+        assert each.estimate == pytest.approx(value, rel=0.01)
 
 
 def test_intervals_of_incomplete_equations_are_doubted():

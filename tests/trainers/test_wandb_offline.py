@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from forked import Forks
 
 from phihp_torchrl.trainers import LoggerConfig, run
 
-from forked import Forks
 from .run_parts import rows
 from .tally import tally_config
 
