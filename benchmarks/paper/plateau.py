@@ -24,8 +24,7 @@ import torch
 from measures import DEFAULT_SAMPLES
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
-from phihp_torchrl.trainers import PolicyConfig
-from phihp_torchrl.trainers.plateau import Plateau, Schedule
+from phihp_torchrl.trainers import Plateau, PolicyConfig, Schedule
 
 RUNS, RESULTS = Path("results/runs"), Path("results/plateau")
 DEFAULT = (PolicyConfig.patience, PolicyConfig.tail)

@@ -26,6 +26,7 @@ from phihp_torchrl.trainers.model import ModelTrainer
 from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
 from phihp_torchrl.trainers.next_steps import next_steps, resume_command
 from phihp_torchrl.trainers.phases import PHASES, Phase, PhaseKind, register_phase
+from phihp_torchrl.trainers.plateau import Plateau, Schedule
 from phihp_torchrl.trainers.plugins import import_plugins
 from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.policy_config import PolicyConfig

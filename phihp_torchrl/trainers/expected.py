@@ -66,7 +66,7 @@ def expect(config: RunConfig, path: Path) -> Expected:
     Examples:
         >>> found = expect(RunConfig("pendulum-swingup"), Path("nowhere/run"))
         >>> sorted(found.middle), found.low["policy"] < found.high["policy"]
-        (['evaluate', 'model', 'policy'], True)
+        (['calibrate', 'evaluate', 'model', 'policy'], True)
     """
     names = config.phases_to_do
     earlier = _earlier(config, path)

@@ -77,7 +77,7 @@ class RunConfig:
         >>> from phihp_torchrl.trainers import read_run_config
         >>> config = read_run_config(load_config("pendulum", overrides=["policy.updates=100"]))
         >>> config.section("policy").updates, config.phases
-        (100, ('model', 'policy', 'evaluate'))
+        (100, ('model', 'policy', 'calibrate', 'evaluate'))
     """
 
     task: str

@@ -21,7 +21,6 @@ FAST = (*SMALL, "evaluate.episodes=1", "evaluate.video=false", "evaluate.latency
 
 BRIEF = (
     "progress=false",
-    "calibrate.enabled=false",
     "evaluate.episodes=2",
     "evaluate.latency_actions=3",
     "evaluate.baselines=none",

@@ -25,6 +25,7 @@ TINY = PolicyConfig(
     evaluation_interval=2,
     evaluation_episodes=8,
     random_steps=64,
+    patience=0.0,
     td3=TD3Config(actor_hidden_sizes=(8,), critic_hidden_sizes=(8,)),
     refit=RefitConfig(interval=0),
 )
