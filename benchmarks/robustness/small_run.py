@@ -132,7 +132,7 @@ def _work(
 
 
 def _stop_after(units: int) -> None:
-    made = sys.modules["phihp_torchrl.trainers.run"]._Run
+    made = sys.modules["phihp_torchrl.trainers.run_loop"].RunLoop
     log_unit = made._log_unit
 
     def stopping(self: Any, *arguments: Any) -> None:

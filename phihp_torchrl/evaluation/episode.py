@@ -64,7 +64,8 @@ class Episode:
     @classmethod
     def from_tensors(cls, task: Task, kept: Mapping[str, Any]) -> Episode:
         """The episode of :meth:`to_tensors`."""
-        return cls(task, *(kept[name].numpy() for name in _COLUMNS), bool(kept["terminated"]))
+        columns = {name: kept[name].numpy() for name in _COLUMNS}
+        return cls(task, **columns, terminated=bool(kept["terminated"]))
 
 
 def play_episode(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import logging
+from functools import partial
 from pathlib import Path
 
 from phihp_torchrl.config import names_file
@@ -67,19 +68,19 @@ def show_episode(
     directory.mkdir(parents=True, exist_ok=True)
     files = [directory / f"{name}.png"]
     world = SimulatedWorld(agent.task) if world is None else world
-    options = {"seed": evaluation_seed(seed), "world": world}
+    play = partial(play_episode, agent, agent.task, seed=evaluation_seed(seed), world=world)
     episode = played
     if video:
         try:
             if played is not None and isinstance(world, SimulatedWorld):
                 episode = draw_episode(played, world)
             else:
-                episode = play_episode(agent, agent.task, **options, render=True)
+                episode = play(render=True)
             files.append(write_gif(episode, directory / f"{name}.gif"))
         except (ImportError, ValueError) as error:
             _log.warning("No GIF of the episode: %s", error)
     if episode is None:
-        episode = play_episode(agent, agent.task, **options)
+        episode = play()
     predicted = None
     if agent.dynamics is not None:
         predicted = predict_episode(agent.dynamics, episode)

@@ -260,8 +260,10 @@ class EvaluatePhase:
         # Single plans are compiled already if their time was measured.
         agent = self.agent if self.settings.latency_actions else _eager(self.agent)
         curve = return_curve(read_rows(self.directory.metrics))
-        shown = {"video": video, "curve": curve, "played": self._played}
-        for path in show_episode(agent, place, world=self.world, **shown):
+        files = show_episode(
+            agent, place, world=self.world, video=video, curve=curve, played=self._played
+        )
+        for path in files:
             self.new_files.append(NewFile(f"evaluate/{path.stem}{path.suffix}", path))
 
 

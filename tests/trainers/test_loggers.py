@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from phihp_torchrl.trainers import LoggerConfig, RunLogger, make_logger, run
+from phihp_torchrl.trainers import LoggerConfig, RunLogger, make_logger, run, run_loop
 from phihp_torchrl.trainers.metrics_table import MetricsTable
 
-from .run_parts import CONFIG, run_module
+from .run_parts import CONFIG
 
 
 def test_the_table_grows_columns_and_forgets_rows(tmp_path: Path) -> None:
@@ -60,7 +60,7 @@ def test_a_logger_that_fails_later_does_not_end_the_run(
         def log(self, metrics: Any, unit: int) -> None:
             raise OSError("the network is gone")
 
-    monkeypatch.setattr(run_module, "make_logger", lambda *_, **__: Broken())
+    monkeypatch.setattr(run_loop, "make_logger", lambda *_, **__: Broken())
     assert run(replace(CONFIG, phases=("model",)), tmp_path / "run").finished
     assert "the network is gone" in caplog.text
 

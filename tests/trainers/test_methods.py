@@ -17,9 +17,10 @@ from phihp_torchrl.deployment import load_agent
 from phihp_torchrl.tasks import get_task, list_tasks, register_task
 from phihp_torchrl.trainers import read_result, run
 from phihp_torchrl.trainers.checkpoints import load_state
+from phihp_torchrl.trainers.run_loop import RunLoop
 
 from .method_parts import TASKS, small
-from .run_parts import CONFIG, Crash, assert_equal, forget_settings, rows, run_module
+from .run_parts import CONFIG, Crash, assert_equal, forget_settings, rows
 
 PARTS = {
     "hybrid_planner": {"planner", "actor"},
@@ -63,7 +64,7 @@ def test_a_run_that_crashed_goes_on_to_the_same_end(
     wholes: dict[str, Path], tmp_path: Path, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     units = len(rows(wholes[method]))
-    log_unit = run_module._Run._log_unit
+    log_unit = RunLoop._log_unit
 
     def crash(self: Any, *arguments: Any) -> None:
         log_unit(self, *arguments)
@@ -72,7 +73,7 @@ def test_a_run_that_crashed_goes_on_to_the_same_end(
             raise Crash
 
     crashed: set[int] = set()
-    monkeypatch.setattr(run_module._Run, "_log_unit", crash)
+    monkeypatch.setattr(RunLoop, "_log_unit", crash)
     with pytest.raises(Crash):
         run(small(method), tmp_path / "run")
     for _ in range(3):

@@ -16,8 +16,9 @@ from torchrl.checkpoint import CheckpointError
 from phihp_torchrl.trainers import run
 from phihp_torchrl.trainers.checkpoints import load_state, save_state
 from phihp_torchrl.trainers.interrupt import Interrupt
+from phihp_torchrl.trainers.run_loop import RunLoop
 
-from .run_parts import CONFIG, UNITS, Crash, assert_same_run, rows, run_module
+from .run_parts import CONFIG, UNITS, Crash, assert_same_run, rows
 
 KILLS = {
     "model: after its row, before its checkpoint": (1, "_log_unit"),
@@ -29,16 +30,17 @@ KILLS = {
 KILLED = """
 import os, signal
 from phihp_torchrl.trainers import run
-from trainers.run_parts import CONFIG, run_module
+from phihp_torchrl.trainers.run_loop import RunLoop
+from trainers.run_parts import CONFIG
 
-method = getattr(run_module._Run, {name!r})
+method = getattr(RunLoop, {name!r})
 
 def killed(self, *arguments):
     method(self, *arguments)
     if self.position.unit == {unit}:
         os.kill(os.getpid(), signal.SIGKILL)
 
-setattr(run_module._Run, {name!r}, killed)
+setattr(RunLoop, {name!r}, killed)
 run(CONFIG, {path!r})
 """
 
@@ -59,14 +61,14 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(
 def test_a_crash_loses_nothing(
     whole: Path, tmp_path: Path, unit: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log_unit = run_module._Run._log_unit
+    log_unit = RunLoop._log_unit
 
     def crash(self: Any, *arguments: Any) -> None:
         log_unit(self, *arguments)
         if self.position.unit == unit:
             raise Crash
 
-    monkeypatch.setattr(run_module._Run, "_log_unit", crash)
+    monkeypatch.setattr(RunLoop, "_log_unit", crash)
     with pytest.raises(Crash):
         run(CONFIG, tmp_path / "run")
     monkeypatch.undo()
@@ -78,14 +80,14 @@ def test_a_signal_ends_a_run_after_the_unit_and_its_checkpoint(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     number = signal.SIGTERM
-    log_unit = run_module._Run._log_unit
+    log_unit = RunLoop._log_unit
 
     def interrupt(self: Any, *arguments: Any) -> None:
         if self.position.unit == 3:
             os.kill(os.getpid(), number)
         log_unit(self, *arguments)
 
-    monkeypatch.setattr(run_module._Run, "_log_unit", interrupt)
+    monkeypatch.setattr(RunLoop, "_log_unit", interrupt)
     rarely = replace(CONFIG, checkpoint_interval=1000.0)
     result = run(rarely, tmp_path / "run")
     monkeypatch.undo()
@@ -109,14 +111,14 @@ def test_the_second_signal_stops_at_once() -> None:
 def test_a_run_survives_a_damaged_checkpoint(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    save = run_module._Run._save
+    save = RunLoop._save
 
     def crash(self: Any, *arguments: Any) -> None:
         save(self, *arguments)
         if self.position.unit == 4:
             raise Crash
 
-    monkeypatch.setattr(run_module._Run, "_save", crash)
+    monkeypatch.setattr(RunLoop, "_save", crash)
     with pytest.raises(Crash):
         run(CONFIG, tmp_path / "run")
     monkeypatch.undo()

@@ -50,17 +50,17 @@ def history(path: Path) -> dict[int, dict[str, str]]:
 KILLED = """
 import os, signal
 from phihp_torchrl.trainers import LoggerConfig, run
-from trainers.run_parts import run_module
+from phihp_torchrl.trainers.run_loop import RunLoop
 from trainers.tally import register_tally, tally_config
 
-log_unit = run_module._Run._log_unit
+log_unit = RunLoop._log_unit
 
 def killed(self, *arguments):
     log_unit(self, *arguments)
     if self.position.unit == 4:
         os.kill(os.getpid(), signal.SIGKILL)
 
-run_module._Run._log_unit = killed
+RunLoop._log_unit = killed
 register_tally()
 run(tally_config(logger=LoggerConfig("wandb", mode="offline")), {path!r})
 """

@@ -249,9 +249,9 @@ def test_a_cell_that_failed_at_its_start_can_be_corrected(
     config: GridConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its settings are on disk already, and nothing else is."""
-    module = sys.modules["phihp_torchrl.trainers.run"]
+    module = sys.modules["phihp_torchrl.trainers.run_loop"]
     with monkeypatch.context() as patch:
-        patch.setattr(module._Run, "_make_phase", lambda *_: 1 / 0)
+        patch.setattr(module.RunLoop, "_make_phase", lambda *_: 1 / 0)
         assert do(config).status is Status.FAILED
     files = config.files(Path())
     assert (files.run / "config.yaml").is_file()
