@@ -4,8 +4,8 @@
 
 Replays the imagined returns that results/runs has of default runs through the rule by which the
 policy phase ends, for several values of ``policy.patience`` and ``policy.tail``. A kept run has the
-mean of its returns alone, so the rule's standard error is zero here, and rates do not fall early in
-a replay: what it loses is an upper bound there, what it saves is not.
+mean of its returns alone. So every rise of more than 0.1 % counts here, where a run asks for two
+standard errors as well and may end earlier; and rates do not fall early in a replay.
 Writes results/plateau/README.md.
 """
 
@@ -110,7 +110,8 @@ def main(words: Sequence[str] | None = None) -> None:
         "`policy.patience` and `policy.tail`; the last are the defaults. In a cell: the share of "
         "all updates at which a run ends, then what its best actor loses in imagined return, mean "
         "(largest). In a replay learning rates do not fall early, which is where late gains come "
-        "from.\n\n"
+        "from; and a rise need not be beyond two standard errors, for a run keeps the mean of its "
+        "returns alone, so a run itself may end earlier.\n\n"
         f"{markdown_table(header, rows(curves(arguments.runs)))}\n"
         f"Made at {commit_text(origin)}, {machine_text(origin)}.\n"
     )

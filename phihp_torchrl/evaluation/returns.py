@@ -202,7 +202,7 @@ def _play_model(
         next_state, reward, terminated = world.transition(state, action)
         if judged.limits:
             tally.judge(task.split(next_state)[0], task.command(task.split(state)[1], action))
-        observed.append(world.observe(next_state)[0])
+        observed.append(world.observe(next_state[:1])[0])
         taken.append((action[0], reward[0]))
         # The state of an episode that has ended is not changed any more.
         state = torch.where((tally.alive & ~terminated).unsqueeze(-1), next_state, state)

@@ -33,7 +33,7 @@ SEEDS = "import os, torch; os.register_at_fork(after_in_child=torch.seed)"
 
 
 TRIES = 2
-"""Of the asynchronous collector, which once in twenty gave no answer; why is not known."""
+"""Of the asynchronous collector, which now and then gives no answer; why is not known."""
 
 
 def run(place: Path, *scripts: str) -> subprocess.CompletedProcess[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import pi
 
 import gymnasium
@@ -88,19 +89,14 @@ MOUNTAIN_CAR = Task(
     terminated=arrived,
     exploration_reward=speed,
 )
-PLAIN_CAR = Task(
+PLAIN_CAR = replace(
+    MOUNTAIN_CAR,
     name="gym-mountain-car-as-it-is",
     system=CarPerStep(),
-    action_high=(1.0,),
     time_step=1.0,
     max_steps=999,
     velocity_limits={"x_dot": 0.07},
-    position_limits={"x": (-1.2, 0.6)},
-    reset=Box((-0.6, 0.0), (-0.4, 0.0)),
     coverage=Box((-1.2, -0.07), (0.45, 0.07)),
-    reward=mountain_car_reward,
-    terminated=arrived,
-    exploration_reward=speed,
 )
 PENDULUM_V1 = Task(
     name="gym-pendulum",
