@@ -102,6 +102,11 @@ def changes_text(changes: dict[str, Any]) -> str:
     return ", ".join(f"{key}={value}" for key, value in changes.items()) or "as given"
 
 
+def gain_text(found: Mapping[str, Any]) -> str:
+    """A gain over the actor and its standard error, in words."""
+    return f"{found['gain']:+.2f} ± {found['gain_error']:.2f}"
+
+
 def rows(results: dict[str, dict[str, Any]]) -> tuple[list[list[str]], list[list[str]]]:
     """The rows of both tables."""
     imagined, real = [], []
@@ -110,10 +115,11 @@ def rows(results: dict[str, dict[str, Any]]) -> tuple[list[list[str]], list[list
             [
                 task,
                 found["acting"] + ("" if found["certain"] else ", in doubt"),
-                f"{changes_text(found['changes'])} ({found['reason']})",
+                f"{found['way']}: {changes_text(found['changes'])}",
                 str(found["episodes"]),
-                f"{found['gain']:+.2f} ± {found['gain_error']:.2f}",
-                *(f"{found[f'{way}_chatter']:.3f}" for way in ("given", "planner", "actor")),
+                gain_text(found),
+                *(f"{found[f'{who}_chatter']:.3f}" for who in ("planner", "actor")),
+                "; ".join(f"{name} {gain_text(way)}" for name, way in found["ways"].items()),
                 f"{found['cpu_seconds']:.0f}",
             ]
         )
@@ -137,7 +143,7 @@ def write(results: dict[str, dict[str, Any]], not_run: Iterable[str]) -> None:
     """The tables of all tasks done so far."""
     imagined, real = rows(results)
     first = ["task", "acts", "settings", "episodes", "gain over the actor"]
-    first += ["chatter as given", "chosen", "actor", "CPU s"]
+    first += ["chatter", "of the actor", "all ways", "CPU s"]
     second = ["task", "episodes", "as given", "chosen", "actor", "calibrated less as given"]
     second += ["chosen less actor", "chatter as given", "chosen", "actor"]
     left = ", ".join(not_run)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,30 +15,33 @@ from torch import Tensor
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.planners import SearchConfig, score_sequences
-from phihp_torchrl.trainers.calibrate_budget import Price, fit_rounds, rounds_cost
-from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
+from phihp_torchrl.trainers.calibrate_budget import Price, first_episodes
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
-from phihp_torchrl.trainers.calibrate_end import End
 from phihp_torchrl.trainers.calibrate_report import report, summary, write_table
-from phihp_torchrl.trainers.calibrate_rule import late_weight, stretches
+from phihp_torchrl.trainers.calibrate_rule import Choice, Way, choose
+from phihp_torchrl.trainers.calibrate_ways import calmer, leaving
 from phihp_torchrl.trainers.context import Context
-from phihp_torchrl.trainers.imagined_play import Played, Player
+from phihp_torchrl.trainers.imagined_play import Played, play
 from phihp_torchrl.trainers.phases import Phase, register_phase
 
+# An actor rests that has at most this chatter in the second halves of its episodes, where plans
+# promise at most the reward of so many steps beyond it.
+_RESTS, _LITTLE = 0.02, 3.0
 # States of the actor's second halves, for each episode, at which plans say what they promise.
 _PROMISES = 8
 _PROMISE_SHARE = 0.95
+# Ways to plan that are tried whatever they cost; further ones as far as the budget goes.
+_IN_ANY_CASE = 2
 
 
 class CalibratePhase:
     """Chooses the planner's settings by paired imagined episodes, or the actor.
 
-    Every setting of a short grid plans for some steps, from the task's starts and from states in
-    the second half of the actor's episodes; then the actor takes over. In each round more steps are
-    planned, by the better half of the settings. The first of the last round, the settings as given
-    and the actor then play on from other states of both sorts, from more of them while it is in
-    doubt who is to act, and a rule chooses. All of this happens in the model, with the same starts
-    and noise for every setting, so no real step is taken.
+    A few ways to plan and the actor play whole episodes of the model from the same starts, with the
+    same noise, and a rule (:func:`~phihp_torchrl.trainers.calibrate_rule.choose`) chooses. Where
+    the actor rests in the end, and plans promise little beyond it, the one way is a plan that
+    leaves it alone there; else there are the settings as given and calmer ones. More episodes are
+    played while it is in doubt who is to act. No real step is taken.
 
     Args:
         agent: the agent, with model, actor and planner; it is not compiled.
@@ -49,10 +53,11 @@ class CalibratePhase:
         >>> from phihp_torchrl import Agent, HybridDynamics, get_task
         >>> from phihp_torchrl.agents import Actor
         >>> from phihp_torchrl.planners import CEMConfig
-        >>> task = get_task("pendulum")
+        >>> from dataclasses import replace
+        >>> task = replace(get_task("pendulum"), max_steps=10)
         >>> small = CEMConfig(2, optim_steps=1, num_candidates=8, top_k=2, num_policy_candidates=2)
         >>> parts = {"dynamics": HybridDynamics.hybrid(task), "actor": Actor(task)}
-        >>> config = CalibrateConfig(True, 2, rounds=(2,), follow_steps=2, max_episodes=2, budget=1)
+        >>> config = CalibrateConfig(True, 2, max_episodes=2, budget=1)
         >>> phase = CalibratePhase(Agent(task, **parts, planner_config=small), config, seed=0)
         >>> while not phase.done:
         ...     metrics = phase.advance()
@@ -66,18 +71,15 @@ class CalibratePhase:
         assert agent.dynamics is not None
         assert agent.planner_config is not None
         self.agent, self.config, self.seed, self.path = agent, config, seed, path
-        self.actor = agent.actor_alone()
         self.base: SearchConfig = agent.planner_config
         self.world_model = TaskWorldModel(agent.task, agent.dynamics)
-        self.rounds: list[list[Trial]] = [[] for _ in config.rounds]
+        self.price = Price.of(agent)
+        self.ways: dict[str, dict[str, Any]] = {}
+        self.played: dict[str, list[list[float]]] = {}
+        self.spent, self.episodes = 0.0, 0
         self.final: dict[str, Any] = {}
-        self.settings: list[dict[str, Any]] = []
-        self._players: dict[int, Player] = {}
-        self._count = len(grid(self.base, 1.0, 1.0))  # of settings, at most
-        price = Price.of(agent)
-        self._steps, self._episodes = fit_rounds(config, price, self._count)
-        spent = rounds_cost(config, price, self._steps, self._episodes, self._count)
-        self.end = End(agent, config, self.world_model, seed, price, spent, self._steps[-1])
+        self._starts: Tensor | None = None
+        self._of_actor: Played | None = None
 
     @property
     def done(self) -> bool:
@@ -86,12 +88,9 @@ class CalibratePhase:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Trials that are done, and all that are foreseen; at the end, each lot of episodes."""
-        count, total = len(self.settings) or self._count, 0
-        for _ in self.config.rounds:
-            total, count = total + count, (count + 1) // 2
-        stages = len(self.end.lots)
-        return sum(map(len, self.rounds)) + stages, total + stages + (not self.done)
+        """Episodes that are played, and all that are foreseen."""
+        count = sum(len(of[0]) for of in self.played.values())
+        return count, count if self.done else max(len(self.ways) * self.episodes, count + 1)
 
     @property
     def acting(self) -> str:
@@ -104,24 +103,23 @@ class CalibratePhase:
         return replace(self.base, **self.final.get("changes", {}))
 
     def advance(self) -> dict[str, float]:
-        """Try the next setting, or let the finalists play some episodes."""
-        if not self.settings:
+        """Let the next way to plan play its episodes, and choose once all have."""
+        if self._starts is None:
             self._prepare()
-        for index, steps in enumerate(self._steps):
-            contenders = self._contenders(index)
-            done = len(self.rounds[index])
-            if done < len(contenders):
-                number = contenders[done]
-                trial = self._try(number, steps)
-                self.rounds[index].append(trial)
-                return {
-                    "calibrate/setting": float(number),
-                    "calibrate/steps": float(steps),
-                    "calibrate/gain": trial.mean,
-                    "calibrate/gain_error": trial.standard_error,
-                    "calibrate/chatter": trial.chatter,
-                }
-        return self._play_final()
+        name = next(name for name in self.ways if self._missing(name))
+        self._play(name)
+        way, actor = self._way(name), self._actor(name)
+        gain, error = way.ahead_of(actor)
+        metrics = {
+            "way": float(list(self.ways).index(name)),
+            "episodes": float(len(way.returns)),
+            "gain": gain,
+            "gain_error": error,
+            "chatter": way.mean_chatter,
+        }
+        if not any(map(self._missing, self.ways)):
+            metrics |= self._choose()
+        return {f"calibrate/{key}": value for key, value in metrics.items()}
 
     def parts(self) -> dict[str, Any]:
         """The planner's settings and how to act, as arguments of :class:`~phihp_torchrl.Agent`."""
@@ -132,43 +130,38 @@ class CalibratePhase:
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that a resumed run needs; what was planned is planned again where needed."""
-        return {
-            "rounds": [[asdict(trial) for trial in trials] for trials in self.rounds],
-            "settings": self.settings,
-            "end": self.end.state_dict(),
-            "final": self.final,
-        }
+        """Everything that a resumed run needs."""
+        names = ("ways", "played", "spent", "episodes", "final")
+        return {name: copy.deepcopy(getattr(self, name)) for name in names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a :meth:`state_dict`."""
-        if state["settings"]:
-            self._prepare()
-        self.settings = [dict(changes) for changes in state["settings"]]
-        self.rounds = [[_trial(kept) for kept in trials] for trials in state["rounds"]]
-        self.end.load_state_dict(state["end"])
-        self.final = dict(state["final"])
+        for name, value in state.items():
+            setattr(self, name, copy.deepcopy(value))
 
     def _prepare(self) -> None:
-        """Imagine the actor's episodes, and from these the starts and the grid."""
-        task, episodes = self.agent.task, self._episodes
+        """Imagine the actor's episodes, and from these the ways to plan."""
+        task, config = self.agent.task, self.config
         generator = torch.Generator().manual_seed(self.seed)
         device = next(self.agent.parameters()).device
-        most = self.config.max_episodes
-        counts = (episodes + most, episodes, most)
-        starts = [task.sample_start([count], generator).to(device) for count in counts]
-        played = Player(self.actor, self.world_model, starts[0]).play(task.max_steps)
-        share = 0.5 + 0.5 * torch.rand(_PROMISES, counts[0], generator=generator).to(device)
-        index = (share * played.lengths).long()
-        late = played.states.gather(0, index[..., None].expand(-1, -1, task.state_dim))
-        self._starts = torch.cat([starts[1], late[0, :episodes]])
-        self.end.starts, self.end.late = starts[2], late[0, episodes:]
-        late = late[:, :episodes]
-        self.end.length = played.lengths.double().mean().item()
-        steps = self._steps[-1] + self.config.follow_steps
-        self._of_actor = Player(self.actor, self.world_model, self._starts).play(steps).total
+        starts = task.sample_start([config.max_episodes], generator).to(device)
+        actor, steps = self.agent.actor_alone(), task.max_steps
+        played = play(actor, self.world_model, starts, steps=steps)
+        self._starts, self._of_actor = starts, played
+        if self.ways:  # a resumed run has them
+            return
+        share = 0.5 + 0.5 * torch.rand(_PROMISES, config.episodes, generator=generator).to(device)
+        index = (share * played.lengths[: config.episodes]).long()[..., None]
+        states = played.states[:, : config.episodes]
+        late = states.gather(0, index.expand(-1, -1, task.state_dim)).flatten(0, 1)
         reward = (played.total / played.lengths).abs().mean().item()
-        self.settings = grid(self.base, self._promise(late.flatten(0, 1)), reward)
+        promise = self._promise(late)
+        margin = leaving(self.base, promise, reward)
+        if margin and played.chatter().mean() <= _RESTS and promise <= _LITTLE * reward:
+            self.ways = {"leaving": margin}
+        else:
+            self.ways = {"given": {}, **calmer(self.base, reward)}
+        self.episodes = first_episodes(config, self.price, self._longest, len(self.ways))
 
     @torch.no_grad()
     def _promise(self, state: Tensor) -> float:
@@ -191,66 +184,70 @@ class CalibratePhase:
         gain = gain[gain.isfinite()]
         return gain.quantile(_PROMISE_SHARE).item() if len(gain) else 0.0
 
-    def _contenders(self, index: int) -> list[int]:
-        """Numbers of the settings of a round: all, or the better half of the round before."""
-        if index == 0:
-            return list(range(len(self.settings)))
-        before = rank(self.rounds[index - 1])
-        better = before[: (len(before) + 1) // 2]
-        return [self.settings.index(dict(trial.changes)) for trial in better]
-
     def _planning(self, changes: Mapping[str, Any]) -> Agent:
         return self.agent.with_planner(replace(self.base, **changes))
 
-    def _try(self, number: int, steps: int) -> Trial:
-        changes, episodes = self.settings[number], self._episodes
-        if number not in self._players:  # a resumed run plays again what it had played
-            agent = self._planning(changes)
-            self._players[number] = Player(agent, self.world_model, self._starts, self.seed)
-        player = self._players[number]
-        played = player.play(steps)
-        whole = self._steps[-1] + self.config.follow_steps
-        gain = player.followed_by(self.actor, whole - steps) - self._of_actor
-        gain = gain.reshape(2, episodes)
-        gain[1] *= late_weight(gain, stretches(self.end.length, steps))
-        late = Played(
-            played.states,
-            played.total[episodes:],
-            played.lengths[episodes:],
-            played.changes[:, episodes:],
-        )
-        return Trial(
-            changes,
-            steps,
-            tuple(tuple(row) for row in gain.tolist()),
-            late.chatter(torch.zeros_like(late.lengths)).mean().item(),
-        )
+    def _missing(self, name: str) -> int:
+        """Episodes that a way has yet to play; none of one that would exceed the budget."""
+        count = self.episodes - len(self.played.get(name, [[]])[0])
+        dear = self.spent + self._cost(count, self._longest) > self.config.budget
+        optional = name not in self.played and list(self.ways).index(name) >= _IN_ANY_CASE
+        return 0 if dear and optional else count
 
-    def _play_final(self) -> dict[str, float]:
-        """Let the finalists play episodes of the end, and choose once there are enough."""
-        self._players.clear()
-        if not self.end.changes:
-            others = [trial.changes for trial in rank(self.rounds[-1]) if trial.changes]
-            self.end.changes = {"given": {}, **({"other": dict(others[0])} if others else {})}
-        self.end.play()
-        choice = self.end.choice()
-        if choice.certain or not self.end.may_go_on():
-            self.final = summary(choice, self.end)
-            report(self.final)
-            if self.path is not None:
-                write_table(self.path, self.final, self.planner_config, self.rounds)
-        numbers = {name: value for name, value in self.final.items() if isinstance(value, float)}
-        numbers |= {"gain": choice.gain, "gain_error": choice.gain_error}
-        return {
-            "calibrate/episodes": float(self.end.episodes),
-            **{f"calibrate/{name}": value for name, value in numbers.items()},
-            "calibrate/acting_planner": float(choice.acting == "planner"),
-        }
+    @property
+    def _longest(self) -> int:
+        """Steps of the longest of the actor's episodes, as which a plan's are taken to be."""
+        assert self._of_actor is not None
+        return len(self._of_actor.changes)
 
+    def _cost(self, episodes: int, steps: int) -> float:
+        return steps * self.price.plan(episodes) if episodes else 0.0
 
-def _trial(kept: Mapping[str, Any]) -> Trial:
-    differences = tuple(tuple(row) for row in kept["differences"])
-    return Trial(dict(kept["changes"]), kept["steps"], differences, kept["chatter"])
+    def _play(self, name: str) -> None:
+        """Let a way to plan play the episodes that it misses."""
+        assert self._starts is not None
+        count, steps = self._missing(name), self.agent.task.max_steps
+        lot = slice(self.episodes - count, self.episodes)
+        agent, seed = self._planning(self.ways[name]), self.seed + lot.start
+        found = play(agent, self.world_model, self._starts[lot], steps=steps, seed=seed)
+        self.spent += self._cost(count, len(found.changes))
+        before = self.played.get(name, [[], []])
+        new = (found.total.tolist(), found.chatter().tolist())
+        self.played[name] = [[*old, *more] for old, more in zip(before, new, strict=True)]
+
+    def _way(self, name: str) -> Way:
+        returns, chatter = map(tuple, self.played[name])
+        return Way(returns, chatter, self.ways[name])
+
+    def _actor(self, beside: str) -> Way:
+        """What the actor earned in the episodes that a way to plan has played."""
+        assert self._of_actor is not None
+        count, played = len(self.played[beside][0]), self._of_actor
+        return Way(tuple(played.total[:count].tolist()), tuple(played.chatter()[:count].tolist()))
+
+    def _choose(self) -> dict[str, float]:
+        """Choose, or ask for as many episodes again."""
+        ways = {name: self._way(name) for name in self.played}
+        actor = self._actor(next(iter(ways)))
+        choice = choose(ways, actor, confidence=self.config.confidence)
+        if not choice.certain and self._may_go_on():
+            self.episodes = min(2 * self.episodes, self.config.max_episodes)
+            self.ways = {name: self.ways[name] for name in ways}
+        else:
+            self._end(choice, ways, actor)
+        return {"acting_planner": float(choice.acting == "planner")}
+
+    def _may_go_on(self) -> bool:
+        """Whether the limit of episodes and the budget allow as many episodes again."""
+        each = self.spent / max(1, self.episodes)
+        more = min(self.episodes, self.config.max_episodes - self.episodes)
+        return more > 0 and self.spent + each * more <= self.config.budget
+
+    def _end(self, choice: Choice, ways: Mapping[str, Way], actor: Way) -> None:
+        self.final = summary(choice, ways, actor)
+        report(self.final)
+        if self.path is not None:
+            write_table(self.path, self.final, self.planner_config)
 
 
 def _build(context: Context) -> Phase:
@@ -263,4 +260,4 @@ def _build(context: Context) -> Phase:
     )
 
 
-register_phase("calibrate", CalibrateConfig, _build, unit="trials")
+register_phase("calibrate", CalibrateConfig, _build, unit="episodes")

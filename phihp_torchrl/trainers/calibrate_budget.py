@@ -14,10 +14,8 @@ from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 _CALL = 1000
 # Weights of a network that take as long as a transition of the model.
 _WEIGHTS = 10_000
-# Episodes below which a standard error says little, and steps below which a plan shows nothing.
-_LEAST, _FEWEST, _ENOUGH = 3, 3, 16
-# Of what the rounds leave, the share of the first episodes at the end; the rest is for doubt.
-_FIRST = 0.25
+# Episodes that each way plays in any case: below them a standard error says little.
+_LEAST = 3
 
 
 @dataclass(frozen=True)
@@ -58,74 +56,25 @@ class Price:
         return total / getattr(planner, "replan_every", 1)
 
 
-def rounds_cost(
-    config: CalibrateConfig, price: Price, rounds: tuple[int, ...], episodes: int, count: int
-) -> float:
-    """Transitions of ``rounds`` of so many planned steps, which begin with ``count`` settings."""
-    rows, total, before = 2 * episodes, 0.0, 0
-    for steps in rounds:
-        planned = (steps - before) * price.plan(rows)
-        total += count * (planned + config.follow_steps * (_CALL + rows))
-        before, count = steps, (count + 1) // 2
-    return total
-
-
-def fit_rounds(config: CalibrateConfig, price: Price, count: int) -> tuple[tuple[int, ...], int]:
-    """Planned steps of the rounds, and their episodes, for half of the budget.
-
-    Where that does not pay for all, there are fewer episodes, three at least; then fewer steps,
-    three at least, and one more in each round.
+def first_episodes(config: CalibrateConfig, price: Price, steps: int, ways: int) -> int:
+    """Episodes that each way of planning plays before there is doubt.
 
     Args:
         config: settings of the phase.
         price: of a plan.
-        count: settings in the first round.
+        steps: of an episode.
+        ways: number of ways.
 
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig
         >>> config = CalibrateConfig()
-        >>> [fit_rounds(config, Price(CEMConfig(steps)), 9) for steps in (5, 20, 100)]
-        [((10, 30), 6), ((5, 15), 3), ((3, 4), 3)]
+        >>> [first_episodes(config, Price(CEMConfig(steps)), 500, 4) for steps in (3, 5, 10)]
+        [6, 6, 3]
     """
-    most = config.rounds[-1]
-    for episodes in range(config.episodes, min(_LEAST, config.episodes) - 1, -1):
-        if rounds_cost(config, price, config.rounds, episodes, count) <= config.budget / 2:
-            return config.rounds, episodes
-    rounds = config.rounds
-    for last in range(most - 1, 0, -1):
-        rounds = _shorter(config.rounds, last / most)
-        if rounds_cost(config, price, rounds, episodes, count) <= config.budget / 2:
-            break
-    return rounds, episodes
-
-
-def final_steps(
-    config: CalibrateConfig, price: Price, rest: float, least: int, longest: int
-) -> int:
-    """Steps that two plans play at the end, before the actor takes over.
-
-    The first episodes take a quarter of what is left, so that their number can double twice in
-    doubt; more, where a quarter pays for less than sixteen steps.
-
-    Args:
-        config: settings of the phase.
-        price: of a plan.
-        rest: what the rounds have left of the budget.
-        least: steps that are played in any case.
-        longest: steps of a whole episode.
-    """
-    affordable = rest / (2 * price.plan(2 * config.episodes))
-    steps = max(int(_FIRST * affordable), min(int(affordable), _ENOUGH), least)
-    return min(longest, steps)
-
-
-def _shorter(rounds: tuple[int, ...], share: float) -> tuple[int, ...]:
-    """Rounds of fewer steps, which still rise."""
-    shorter: list[int] = []
-    for steps in rounds:
-        least = shorter[-1] + 1 if shorter else min(_FEWEST, rounds[0])
-        shorter.append(max(least, int(share * steps)))
-    return tuple(shorter)
+    for episodes in range(config.episodes, min(_LEAST, config.episodes), -1):
+        if ways * steps * price.plan(episodes) <= config.budget:
+            return episodes
+    return min(_LEAST, config.episodes)
 
 
 def _network(module: nn.Module | None) -> float:

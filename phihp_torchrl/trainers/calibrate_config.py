@@ -4,13 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from phihp_torchrl.config import (
-    ConfigError,
-    check_count,
-    check_fields,
-    check_not_negative,
-    is_whole,
-)
+from phihp_torchrl.config import ConfigError, check_count, check_fields, check_not_negative
 
 
 @dataclass(frozen=True)
@@ -20,36 +14,29 @@ class CalibrateConfig:
     Args:
         enabled: whether to calibrate; false takes the settings of the section planner as they are,
             and the run has no such phase.
-        episodes: paired imagined episodes, and as many starts in the second half of one.
-        rounds: steps that each setting plans before the actor takes over, in each round; after a
-            round the better half of the settings goes on.
-        follow_steps: steps of the actor after those.
-        confidence: standard errors by which settings must beat those that were given, and by which
-            one of plan and actor beats the other without doubt, in episodes at the end.
-        max_episodes: episodes at the end at most; their number doubles while it is in doubt who is
-            to act.
-        budget: transitions that plans may imagine, of which half is for the rounds; a call of the
-            model counts as a thousand more, and one of a network as one for each ten thousand
-            weights, so a million takes about a second of one core. Three episodes a round, and at
-            the end the steps of the last round, are played in any case.
+        episodes: paired imagined episodes, before there is doubt.
+        confidence: standard errors by which one way to plan must beat another, and by which one of
+            plan and actor beats the other without doubt.
+        max_episodes: episodes at most; their number doubles while it is in doubt who is to act.
+        budget: transitions that plans may imagine; a call of the model counts as a thousand more,
+            and one of a network as one for each ten thousand weights, so a million takes about a
+            second of one core. Three episodes of two ways to plan are played in any case.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.
 
     Examples:
-        >>> CalibrateConfig(rounds=(20, 10))
+        >>> CalibrateConfig(episodes=1)
         Traceback (most recent call last):
         ...
-        phihp_torchrl.config.ConfigError: rounds: expected rising whole numbers >= 2, got (20, 10).
+        phihp_torchrl.config.ConfigError: episodes: expected a whole number >= 2, got 1.
     """
 
     enabled: bool = True
     episodes: int = 6
-    rounds: tuple[int, ...] = (10, 30)
-    follow_steps: int = 50
     confidence: float = 2.0
     max_episodes: int = 48
-    budget: int = 12_000_000
+    budget: int = 30_000_000
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -58,9 +45,4 @@ class CalibrateConfig:
         check_count(self, "episodes", least=2)
         check_count(self, "budget")
         check_count(self, "max_episodes", least=self.episodes)
-        check_count(self, "follow_steps", least=0)
         check_not_negative(self, "confidence")
-        rounds = self.rounds
-        good = bool(rounds) and all(is_whole(steps, 2) for steps in rounds)
-        if not good or list(rounds) != sorted(set(rounds)):
-            raise ConfigError("rounds", f"expected rising whole numbers >= 2, got {rounds}.")

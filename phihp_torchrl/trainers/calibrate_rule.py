@@ -1,4 +1,4 @@
-"""The rule by which settings of the planner, or the actor, are chosen from imagined episodes."""
+"""The rule by which a way to plan, or the actor, is chosen from imagined episodes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 # Of the plan's gain over the actor, what smoothness may cost.
 _SHARE = 0.1
@@ -19,46 +18,47 @@ _SMOOTHER, _NOTICEABLE = 2 / 3, 0.01
 
 
 @dataclass(frozen=True)
-class Finalist:
+class Way:
     """What a way to act earned in imagined episodes.
 
     Args:
         returns: return of each episode, from the same starts and with the same noise for all.
         chatter: mean change of the action in each, in units of the half-range.
         changes: what it changes in the settings of the planner.
-        late: return of each stretch from the second half of the actor's episodes; none by default.
-        weight: how many such stretches an episode has, as often as their differences count at most.
+
+    Examples:
+        >>> Way((1.0, 3.0), (0.0, 0.2)).ahead_of(Way((0.0, 0.0), (0.0, 0.0)))
+        (2.0, 1.0)
     """
 
     returns: tuple[float, ...]
     chatter: tuple[float, ...]
     changes: Mapping[str, Any] = field(default_factory=dict)
-    late: tuple[float, ...] = ()
-    weight: float = 1.0
+
+    @property
+    def mean_return(self) -> float:
+        """Mean of the returns."""
+        return sum(self.returns) / len(self.returns)
 
     @property
     def mean_chatter(self) -> float:
         """Mean of the chatter over episodes."""
         return sum(self.chatter) / len(self.chatter)
 
-    @property
-    def fails(self) -> bool:
-        """Whether a return is not finite."""
-        return not all(map(math.isfinite, self.returns + self.late))
+    def ahead_of(self, other: Way) -> tuple[float, float]:
+        """Mean paired difference of the returns, and its standard error.
 
-    def ahead_of(self, other: Finalist) -> tuple[float, float]:
-        """Mean paired difference of an episode's return, and its standard error.
-
-        It is that of :attr:`returns`, and that of late stretches times :func:`late_weight`.
+        It is minus infinity where one of ours is not finite, and infinity where one of the other's
+        is not.
         """
-        rows = [self.returns, self.late] if self.late else [self.returns]
-        against = [other.returns, other.late] if self.late else [other.returns]
-        differences = torch.tensor(rows).double() - torch.tensor(against).double()
-        if self.late:
-            differences[1] *= late_weight(differences, self.weight)
-        return estimate(differences)
+        if not all(map(math.isfinite, self.returns)):
+            return -math.inf, 0.0
+        if not all(map(math.isfinite, other.returns)):
+            return math.inf, 0.0
+        gap = torch.tensor(self.returns).double() - torch.tensor(other.returns).double()
+        return gap.mean().item(), (gap.std() / len(gap) ** 0.5).item()
 
-    def smoother_than(self, other: Finalist) -> bool:
+    def smoother_than(self, other: Way) -> bool:
         """Whether its chatter is clearly less: two thirds at most."""
         ours, theirs = self.mean_chatter, other.mean_chatter
         return ours <= _SMOOTHER * theirs and theirs - ours >= _NOTICEABLE
@@ -68,110 +68,79 @@ class Choice(NamedTuple):
     """What :func:`choose` has chosen.
 
     Attributes:
-        plan: the plan.
-        reason: why this one: ``"as given"``, ``"better"`` or ``"smoother"``.
+        name: name of the way to plan.
         acting: who acts, ``"planner"`` or ``"actor"``.
         certain: whether more episodes would not change who acts.
         gain: mean return of the plan beyond the actor's.
         gain_error: its standard error, paired.
     """
 
-    plan: Finalist
-    reason: str
+    name: str
     acting: str
     certain: bool
     gain: float
     gain_error: float
 
 
-def choose(
-    given: Finalist, other: Finalist | None, actor: Finalist, *, confidence: float = 2.0
-) -> Choice:
-    """Choose between the plan as given and one other, and between the plan and the actor.
+def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> Choice:
+    """Choose one way to plan, and then between that and the actor.
 
-    The plan as given stays unless the other one
+    The first way stays unless another
 
     - earns more, by over ``confidence`` standard errors of the paired differences, or
-    - is clearly smoother, with at most two thirds of the chatter, and does not earn less by more
-      than a tenth of the given plan's gain over the actor, or a thousandth of the actor's return.
+    - is not behind the actor where the first is, by over one standard error.
 
-    The plan that is chosen acts unless the actor earns more by over one standard error: a plan
-    looks further than its actor and is compared with it at every step, so what is in doubt is more
-    likely a gain. Beyond ``confidence`` standard errors, on either side, the choice is certain;
-    all else is doubtful and deserves more episodes. Where both earn exactly the same in each, the
-    actor, which is cheaper, acts, unless the plan is clearly smoother.
+    Of those that are clearly smoother than what stays, with at most two thirds of its chatter, the
+    smoothest takes its place that does not earn less, by over one standard error, than what
+    smoothness may cost: a tenth of the gain over the actor, or a thousandth of the actor's return.
 
-    One other plan is compared and not a dozen, because the best of a dozen looks better than it is.
-    The one that enters here was picked by other episodes, so its differences here are not favoured
-    by the pick. Episodes that are added in doubt are a second look at the same question, which a
-    bound of two standard errors passes a little more often than one look would; they can only keep
-    a plan from being dropped, and never change the settings for less than the rule above asks.
+    The plan that is chosen acts if it earns more than the actor. If it earns less, but not by over
+    one standard error, it acts unless the actor is clearly smoother: a plan looks further than its
+    actor and is compared with it at every step, so what is in doubt is more likely a gain. Where
+    both earn exactly the same in each episode, the actor, which is cheaper, acts, unless the plan
+    is clearly smoother. Beyond ``confidence`` standard errors, on either side, the choice is
+    certain; all else is doubtful and deserves more episodes. Those are a second look at the same
+    question, which a bound of two standard errors passes a little more often than one look would.
 
     Args:
-        given: the plan with the settings as they are.
-        other: the plan that may replace it; ``None`` for none.
-        actor: the actor alone.
+        ways: what each way to plan earned, by name; the first is the one to be replaced.
+        actor: what the actor alone earned.
         confidence: standard errors of a difference that is no chance.
 
     Examples:
-        >>> given = Finalist((10.0, 12.0, 11.0), (0.4, 0.4, 0.4))
-        >>> smooth = Finalist((10.0, 12.1, 11.0), (0.1, 0.1, 0.1), {"change_cost": 1.0})
-        >>> actor = Finalist((5.0, 6.0, 7.0), (0.0, 0.0, 0.0))
-        >>> choice = choose(given, smooth, actor)
-        >>> choice.reason, choice.acting, choice.certain
-        ('smoother', 'planner', True)
+        >>> given = Way((10.0, 12.0, 11.0), (0.4, 0.4, 0.4))
+        >>> smooth = Way((10.0, 12.1, 11.0), (0.1, 0.1, 0.1), {"change_cost": 1.0})
+        >>> actor = Way((5.0, 6.0, 7.0), (0.0, 0.0, 0.0))
+        >>> choice = choose({"given": given, "calm": smooth}, actor)
+        >>> choice.name, choice.acting, choice.certain
+        ('calm', 'planner', True)
     """
-    plan, reason = given, "as given"
-    if other is not None:
-        ahead, error = other.ahead_of(given)
-        trifle = _TRIFLE * abs(sum(actor.returns) / len(actor.returns))
-        allowed = max(_SHARE * given.ahead_of(actor)[0], trifle)
-        if ahead > confidence * error or (given.fails and not other.fails):
-            plan, reason = other, "better"
-        elif ahead >= -allowed and other.smoother_than(given):
-            plan, reason = other, "smoother"
+    name, *others = ways
+    for other in others:
+        ahead, error = ways[other].ahead_of(ways[name])
+        rescues = _behind(ways[name], actor, confidence) and not _behind(
+            ways[other], actor, confidence
+        )
+        if ahead > confidence * error or rescues:
+            name = other
+    best = ways[name]
+    allowed = max(_SHARE * best.ahead_of(actor)[0], _TRIFLE * abs(actor.mean_return))
+    calm = {
+        other: way.mean_chatter
+        for other, way in ways.items()
+        if way.smoother_than(best) and sum(way.ahead_of(best)) >= -allowed
+    }
+    name = min(calm, key=calm.__getitem__, default=name)
+    plan = ways[name]
     gain, error = plan.ahead_of(actor)
-    acts = gain > -min(confidence, 1.0) * error or (gain >= 0.0 and plan.smoother_than(actor))
-    certain = abs(gain) > confidence * error or gain == error == 0.0
-    return Choice(plan, reason, "planner" if acts else "actor", certain, gain, error)
+    same = gain == error == 0.0
+    close = not (_behind(plan, actor, confidence) or actor.smoother_than(plan))
+    acts = plan.smoother_than(actor) if same else gain > 0.0 or close
+    certain = same or abs(gain) > confidence * error
+    return Choice(name, "planner" if acts else "actor", certain, gain, error)
 
 
-def stretches(length: float, steps: int) -> float:
-    """How many stretches of ``steps`` the second half of an episode has, one at least.
-
-    Examples:
-        >>> stretches(200.0, 20), stretches(200.0, 150)
-        (5.0, 1.0)
-    """
-    return max(1.0, length / 2 / steps)
-
-
-def late_weight(differences: Tensor, most: float) -> float:
-    """How often late differences count: ``most``, if their noise then is not above the others'.
-
-    Where a balance is held, a late stretch has next to no noise and tells what a plan gains or
-    spoils by and by. Where episodes end at a goal, it would drown the rest.
-
-    Args:
-        differences: from the task's starts, and of late stretches, ``[2, episodes]``.
-        most: how many such stretches an episode has.
-
-    Examples:
-        >>> late_weight(torch.tensor([[0.0, 4.0], [0.0, 1.0]]), 10.0)
-        4.0
-    """
-    own, late = differences.std(-1).tolist()
-    if not math.isfinite(own + late) or late * most <= own:
-        return most
-    return max(1.0, own / late)
-
-
-def estimate(differences: Tensor) -> tuple[float, float]:
-    """Sum of the means of rows ``[sorts, episodes]``, and its standard error.
-
-    It is minus infinity where a difference is not finite.
-    """
-    if not differences.isfinite().all():
-        return -math.inf, 0.0
-    variance = differences.var(-1).sum() / differences.shape[-1]
-    return differences.mean(-1).sum().item(), variance.sqrt().item()
+def _behind(plan: Way, actor: Way, confidence: float) -> bool:
+    """Whether a plan earns less than the actor by over one standard error."""
+    gain, error = plan.ahead_of(actor)
+    return gain < 0.0 and gain <= -min(confidence, 1.0) * error

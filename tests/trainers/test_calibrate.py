@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 
 import pytest
@@ -15,24 +14,29 @@ from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
 from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, read_run_config, run
-from phihp_torchrl.trainers.calibrate_budget import Price, final_steps, fit_rounds
-from phihp_torchrl.trainers.calibrate_choice import Trial, grid, rank
-from phihp_torchrl.trainers.calibrate_rule import late_weight
+from phihp_torchrl.trainers import calibrate as calibrate_module
+from phihp_torchrl.trainers.calibrate_budget import Price, first_episodes
+from phihp_torchrl.trainers.calibrate_ways import calmer, leaving
+from phihp_torchrl.trainers.imagined_play import play
 
 from .run_parts import CONFIG, with_sections
 
 SMALL = CEMConfig(
     planning_horizon=3, optim_steps=1, num_candidates=32, top_k=4, num_policy_candidates=2
 )
-TINY = CalibrateConfig(enabled=True, episodes=3, rounds=(3, 6), follow_steps=4, max_episodes=6)
+TINY = CalibrateConfig(enabled=True, episodes=3, max_episodes=6)
 
 
-def make_agent(name="brief-pendulum", planner=SMALL, last_layer=1.0):
+@pytest.fixture
+def restless(monkeypatch):
+    """No actor is taken to rest."""
+    monkeypatch.setattr(calibrate_module, "_RESTS", -1.0)
+
+
+def make_agent(name="brief-pendulum", planner=SMALL):
     torch.manual_seed(0)
     task = get_task(name)
     actor = Actor(task)
-    with torch.no_grad():
-        list(actor.parameters())[-1].mul_(last_layer)
     return Agent(task, dynamics=HybridDynamics.hybrid(task), actor=actor, planner_config=planner)
 
 
@@ -43,59 +47,45 @@ def finished(agent, config=TINY, seed=0, path=None):
     return phase
 
 
-# The grid and the choice.
+# The ways to plan.
 
 
-def test_the_grid_starts_with_the_settings_as_given_and_repeats_none():
-    settings = grid(CEMConfig(), 1.234, 0.5)
-    assert settings[0] == {}
-    assert {"actor_margin": 2.5} in settings
-    calm = {"change_cost": 0.5, "noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
-    assert {**calm, "init_std": 0.1} in settings
-    assert {**calm, "init_std": 0.1, "actor_margin": 2.5} in settings
-    for changes in settings:
-        replace(CEMConfig(), **changes)
-        assert settings.count(changes) == 1
-    assert len(grid(CEMConfig(), 0.0, 0.0)) < len(settings)
+def test_each_way_fits_the_settings_and_changes_them():
+    ways = calmer(CEMConfig(), 0.5)
+    assert list(ways) == ["calm", "mild", "loose"]
+    for changes in ways.values():
+        assert replace(CEMConfig(), **changes) != CEMConfig()
+    assert leaving(CEMConfig(), 1.234, 0.5) == {"actor_margin": 2.5}
+    known = replace(CEMConfig(), warm_start=True)
+    assert "warm_start" not in calmer(known, 0.5)["calm"]
 
 
 def test_a_planner_is_asked_only_for_what_it_has():
-    settings = grid(MPPIConfig(), 1.0, 1.0)
-    assert {key for changes in settings for key in changes} == {
+    ways = calmer(MPPIConfig(), 1.0)
+    assert {key for way in ways.values() for key in way} == {
         "change_cost",
         "noise_beta",
-        "alpha",
-        "planning_horizon",
         "init_std",
     }
+    assert leaving(MPPIConfig(), 1.0, 1.0) == {}
+
+
+def test_what_the_settings_refuse_is_no_way():
+    """The actor alone proposes plans: none goes on from the one before."""
+    guided = CEMConfig(num_candidates=20, num_policy_candidates=20)
+    assert calmer(guided, 1.0) == {}
 
 
 def test_where_plans_promise_nothing_there_is_no_margin_to_try():
-    settings = grid(CEMConfig(), 1e-4, 0.5)
-    assert not any("actor_margin" in changes for changes in settings)
-    narrow = grid(replace(CEMConfig(), init_std=0.05), 1.0, 0.5)
-    assert all(changes.get("init_std", 0.05) == 0.05 for changes in narrow)
-
-
-def trial(mean, spread, chatter, name):
-    early = tuple(mean + spread * e for e in (-1.0, 0.0, 1.0))
-    return Trial({"alpha": name}, 3, (early, (0.0, 0.0, 0.0)), chatter)
-
-
-def test_within_the_noise_of_the_best_the_smoothest_comes_first():
-    best, close, far = trial(2.0, 1.0, 0.4, 1), trial(1.6, 1.0, 0.01, 2), trial(1.0, 1.0, 0.0, 3)
-    assert rank([far, best, close]) == [close, best, far]
-
-
-def test_a_setting_whose_return_is_not_finite_comes_last():
-    bad = Trial({"alpha": 1}, 3, ((math.nan, 1.0), (0.0, 0.0)), 0.0)
-    good = Trial({"alpha": 2}, 3, ((-5.0, -5.0), (0.0, 0.0)), 1.0)
-    assert rank([bad, good]) == [good, bad]
+    assert leaving(CEMConfig(), 1e-4, 0.5) == {}
+    narrow = calmer(replace(CEMConfig(), init_std=0.05), 0.5)
+    assert all("init_std" not in changes for changes in narrow.values())
 
 
 # The phase.
 
 
+@pytest.mark.usefixtures("restless")
 def test_a_plan_that_beats_a_poor_actor_acts(tmp_path):
     """The actor is untrained; the plan looks ahead."""
     planner = replace(SMALL, planning_horizon=8, num_candidates=64)
@@ -105,12 +95,8 @@ def test_a_plan_that_beats_a_poor_actor_acts(tmp_path):
     assert phase.acting == table["acting"] == "planner"
     assert table["planner_return"] > table["actor_return"]
     assert table["gain"] > 0
-    first, second = (
-        [row for row in table["trials"] if row["steps"] == steps] for steps in TINY.rounds
-    )
-    assert len(second) == (len(first) + 1) // 2
-    changes = [row["changes"] for row in first]
-    assert all(row["changes"] in changes for row in second)
+    assert list(table["ways"]) == ["given", "calm", "mild", "loose"]
+    assert table["ways"][table["way"]]["gain"] == table["gain"]
     assert phase.parts()["planner_config"] == phase.planner_config
     assert phase.progress[0] == phase.progress[1]
 
@@ -126,11 +112,12 @@ def test_where_no_plan_is_better_the_actor_acts():
     assert phase.parts()["metadata"]["acting"] == "actor"
 
 
+@pytest.mark.usefixtures("restless")
 def test_the_same_seed_chooses_the_same_wherever_it_is_interrupted():
-    agent, config = make_agent(), replace(TINY, rounds=(2, 3), follow_steps=1)
+    agent, config = make_agent(), replace(TINY, confidence=1e6)
     before = torch.random.get_rng_state()
     begun = CalibratePhase(agent, config, seed=0)
-    for _ in range(13):  # into the second round, whose players have played before
+    for _ in range(6):  # into the second lot
         begun.advance()
     resumed = CalibratePhase(agent, config, seed=0)
     resumed.load_state_dict(begun.state_dict())
@@ -147,8 +134,6 @@ def test_the_same_seed_chooses_the_same_wherever_it_is_interrupted():
     [
         ({"enabled": 1}, "enabled: expected true or false, got 1"),
         ({"episodes": 1}, "episodes: expected a whole number >= 2, got 1"),
-        ({"rounds": ()}, "rounds: expected rising whole numbers >= 2"),
-        ({"rounds": (4, 4)}, "rounds: expected rising whole numbers >= 2"),
         ({"confidence": -1.0}, "confidence: expected a number >= 0"),
         ({"max_episodes": 5}, "max_episodes: expected a whole number >= 6, got 5"),
         ({"budget": 0}, "budget: expected a .*whole number.*, got 0"),
@@ -159,44 +144,66 @@ def test_wrong_settings_are_refused_by_name(wrong, message):
         CalibrateConfig(**wrong)
 
 
+@pytest.mark.usefixtures("restless")
 def test_in_doubt_more_episodes_are_played_up_to_the_limit(caplog):
     """No gain is above so many standard errors."""
     phase = finished(make_agent(), replace(TINY, confidence=1e6))
     assert phase.final["episodes"] == TINY.max_episodes
-    assert [lot["episodes"] for lot in phase.end.lots] == [3, 3]
     assert phase.final["certain"] is False
     assert "Raise calibrate.max_episodes" in caplog.text
-    gain, error = phase.final["gain"], phase.final["gain_error"]
-    assert (phase.acting == "planner") == (gain > -error)
     # The lots are from different starts.
-    assert len(set(phase.end.finalists()["actor"].returns)) == TINY.max_episodes
+    assert all(len(set(returns)) == TINY.max_episodes for returns, _ in phase.played.values())
 
 
-def test_the_budget_ends_doubt_and_shortens_plans():
-    small = finished(make_agent(), replace(TINY, confidence=1e6, budget=100_000))
-    assert small.final["episodes"] == TINY.episodes
-    assert small.final["steps"] == small._steps[-1]
+@pytest.mark.usefixtures("restless")
+def test_the_budget_ends_doubt_and_leaves_ways_out():
+    config = replace(TINY, episodes=5, max_episodes=10, confidence=1e6, budget=100_000)
+    small = finished(make_agent(), config)
+    assert list(small.final["ways"]) == ["given", "calm"]  # these two in any case
+    assert small.final["episodes"] == 3
+    assert small.final["certain"] is False
 
 
-def test_the_first_episodes_at_the_end_take_a_quarter_of_what_is_left():
-    price = Price(SMALL)
-    step = 2 * price.plan(2 * TINY.episodes)  # two plans, from two sorts of starts
-    assert step == 2 * 3 * (1000 + 6 * 32)
+def test_dear_plans_begin_with_fewer_episodes():
+    price, config = Price(SMALL), replace(TINY, episodes=6)
 
-    def steps(paid):
-        return final_steps(TINY, price, rest=paid * step, least=3, longest=100)
+    def first(paid):  # for whole episodes of two plans
+        paying = replace(config, budget=int(2 * 100 * price.plan(paid)))
+        return first_episodes(paying, price, 100, 2)
 
-    assert [steps(paid) for paid in (1e6, 200, 80, 40, 10, 0)] == [100, 50, 20, 16, 10, 3]
+    assert [first(paid) for paid in (100, 6, 5, 4, 1)] == [6, 6, 5, 4, 3]
 
 
-def test_dear_plans_have_fewer_episodes_and_then_fewer_steps():
-    steps, episodes = fit_rounds(TINY, Price(SMALL), 9)
-    assert (steps, episodes) == (TINY.rounds, TINY.episodes)
-    dear = Price(SMALL, actor=1e4)
-    steps, episodes = fit_rounds(replace(TINY, episodes=6), dear, 9)
-    assert episodes == 3
-    assert list(steps) == sorted(set(steps))
-    assert steps[-1] < TINY.rounds[-1]
+def test_episodes_are_whole_and_chatter_is_that_of_their_second_half():
+    phase = finished(make_agent())
+    steps, of = phase.agent.task.max_steps, phase.final
+    actor = phase.agent.actor_alone()
+    played = play(actor, phase.world_model, phase._starts[: of["episodes"]], steps=steps)
+    assert len(played.changes) == steps
+    assert of["actor_return"] == pytest.approx(played.total.mean().item(), rel=1e-5)
+    late = played.changes[steps // 2 :].mean().item()
+    assert of["actor_chatter"] == pytest.approx(late, rel=1e-4)
+
+
+def test_a_plan_that_fails_late_does_not_act(monkeypatch):
+    """What a plan spoils at the end of its episodes counts."""
+
+    def spoilt(agent, *arguments, **options):
+        played = play(agent, *arguments, **options)
+        return played if agent.planner is None else played._replace(total=played.total - 100.0)
+
+    monkeypatch.setattr(calibrate_module, "play", spoilt)
+    phase = finished(make_agent())
+    assert phase.acting == "actor"
+    assert phase.final["certain"] is True
+
+
+def test_an_actor_that_rests_is_left_alone():
+    """A plan gains where the actor is poor, and has no say where it rests."""
+    phase = finished(make_agent())
+    assert phase.final["actor_chatter"] <= 0.02
+    assert list(phase.final["ways"]) == ["leaving"]
+    assert phase.planner_config.actor_margin > 0.0
 
 
 def test_larger_networks_make_plans_dearer():
@@ -204,30 +211,6 @@ def test_larger_networks_make_plans_dearer():
     assert narrow.critics == 0.0  # it has none
     assert narrow.actor > 1.0
     assert narrow.plan(6) > Price(SMALL).plan(6)
-
-
-def test_late_stretches_count_and_chatter_is_theirs():
-    """A calm plan in another's place: the numbers of the end are those of both sorts of starts."""
-    phase = finished(make_agent())
-    of = phase.end.finalists()
-    for way in of.values():
-        assert len(way.returns) == len(way.late) == len(way.chatter) == phase.end.episodes
-    gains = [
-        [
-            ours - theirs
-            for ours, theirs in zip(
-                getattr(of["given"], rows), getattr(of["actor"], rows), strict=True
-            )
-        ]
-        for rows in ("returns", "late")
-    ]
-    weight = late_weight(torch.tensor(gains), of["given"].weight)
-    assert 1.0 <= weight <= of["given"].weight
-    ahead, error = of["given"].ahead_of(of["actor"])
-    assert ahead == pytest.approx(
-        (sum(gains[0]) + weight * sum(gains[1])) / phase.end.episodes, rel=1e-4
-    )
-    assert error > 0
 
 
 # The agent that is shipped.

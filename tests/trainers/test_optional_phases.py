@@ -21,9 +21,7 @@ from phihp_torchrl.trainers.run_request import read_request
 from .run_parts import CONFIG, forget_settings, rows, with_sections
 
 WITHOUT = ("model", "policy", "evaluate")
-ON = CalibrateConfig(
-    enabled=True, episodes=2, rounds=(2,), follow_steps=1, max_episodes=2, budget=1
-)
+ON = CalibrateConfig(enabled=True, episodes=2, max_episodes=2, budget=1)
 
 
 def age(path: Path) -> None:

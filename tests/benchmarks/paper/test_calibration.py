@@ -25,12 +25,15 @@ def test_the_tables_pair_the_episodes_and_name_what_was_not_run(
     found = {
         "acting": "actor",
         "certain": False,
-        "reason": "smoother",
+        "way": "calm",
         "changes": {"alpha": 0.5},
         "gain": 1.0,
         "gain_error": 2.0,
         "episodes": 48,
-        "given_chatter": 0.4,
+        "ways": {
+            "given": {"gain": 2.0, "gain_error": 3.0},
+            "calm": {"gain": 1.0, "gain_error": 2.0},
+        },
         "planner_chatter": 0.1,
         "actor_chatter": 0.0,
         "cpu_seconds": 33.3,
@@ -48,7 +51,8 @@ def test_the_tables_pair_the_episodes_and_name_what_was_not_run(
         for line in (place / "README.md").read_text().splitlines()
     ]
     cells = [line for line in lines if line[0] == "pendulum"]
-    assert cells[0][1:5] == ["actor, in doubt", "alpha=0.5 (smoother)", "48", "+1.00 ± 2.00"]
+    assert cells[0][1:5] == ["actor, in doubt", "calm: alpha=0.5", "48", "+1.00 ± 2.00"]
+    assert cells[0][7] == "given +2.00 ± 3.00; calm +1.00 ± 2.00"
     # The actor acts, so the calibrated agent's episodes are the actor's.
     assert cells[1][1:7] == ["2", "1.5", "4.5", "3.0", "+1.50 ± 0.50", "+1.50 ± 0.50"]
     text = (place / "README.md").read_text()

@@ -1,0 +1,78 @@
+"""The ways to plan that calibration compares, as changes of the planner's settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from typing import Any
+
+from phihp_torchrl.planners import SearchConfig
+
+# Share of a step's reward below which a promise is rounding.
+_NOTHING = 1e-3
+# Std of the search near the previous plan, in units of the half-range.
+_NEAR, _NEARER = 0.3, 0.1
+
+
+def leaving(config: SearchConfig, promise: float, reward: float) -> dict[str, Any]:
+    """A margin of twice what plans promise where the actor rests, which leaves it alone there.
+
+    Args:
+        config: the planner's settings.
+        promise: what its plans promise beyond the actor where that has settled, in units of return.
+        reward: mean absolute reward of a step.
+
+    Returns:
+        The changes; none where plans promise nothing, or where a planner has no margin.
+
+    Examples:
+        >>> from phihp_torchrl.planners import CEMConfig
+        >>> leaving(CEMConfig(), 1.0, 1.0), leaving(CEMConfig(), 0.0, 1.0)
+        ({'actor_margin': 2.0}, {})
+    """
+    if promise < _NOTHING * reward:
+        return {}
+    return _fitting(config, {"actor_margin": _round(2 * promise)})
+
+
+def calmer(config: SearchConfig, reward: float) -> dict[str, dict[str, Any]]:
+    """Three ways to plan calmly, by name, for an actor that does not rest.
+
+    A price of changes alone leaves the noise of the search: the mean of a few elites of a wide
+    Gaussian. So these go on from the previous plan, keep it unless another is better, and look for
+    others nearby, with noise that is smooth along the plan. The price is that of a full change of
+    the action in units of a step's reward: the dearer, the calmer, and the larger the steady error
+    that a plan does not find worth a change.
+
+    Examples:
+        >>> from phihp_torchrl.planners import CEMConfig
+        >>> ways = calmer(CEMConfig(), 1.0)
+        >>> [(name, way["change_cost"], way["init_std"]) for name, way in ways.items()]
+        [('calm', 1.0, 0.1), ('mild', 0.1, 0.1), ('loose', 0.33, 0.3)]
+    """
+    standing = {"noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
+    kinds = (("calm", 1.0, _NEARER), ("mild", 0.1, _NEARER), ("loose", 1 / 3, _NEAR))
+    ways = {}
+    for name, share, near in kinds:
+        price, std = share * reward, min(near, config.init_std)
+        changes = _fitting(config, {"change_cost": _round(price), **standing, "init_std": std})
+        if changes:
+            ways[name] = changes
+    return ways
+
+
+def _fitting(config: SearchConfig, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the changes that the settings know and do not have yet; none if they do not fit."""
+    known = {field.name for field in fields(config)}
+    own = {key: value for key, value in changes.items() if key in known}
+    own = {key: value for key, value in own.items() if getattr(config, key) != value}
+    try:
+        replace(config, **own)
+    except ValueError:
+        return {}
+    return own
+
+
+def _round(number: float) -> float:
+    """A number with two digits, so that a setting can be read."""
+    return float(f"{number:.2g}")
