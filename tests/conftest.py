@@ -6,7 +6,7 @@ import pickle
 import random
 import sys
 from collections.abc import Iterator
-from pathlib import Path
+from io import StringIO, TextIOBase
 from types import ModuleType
 from typing import Any
 
@@ -14,11 +14,9 @@ import numpy as np
 import pytest
 import torch
 from forked import Forks
-from hydra._internal.core_plugins.importlib_resources_config_source import (
-    ImportlibResourcesConfigSource,
-)
 from hypothesis import settings
 from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 
 SEED = 0
 
@@ -59,23 +57,23 @@ def _undrawn() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _parsed_once() -> Iterator[None]:
-    """A YAML file of a package is parsed once, not by each of the hundreds of compositions.
+    """A YAML file is parsed once, not by each of the hundreds of compositions.
 
     That is half of the time of one. Every reader gets an object of its own.
     """
-    parsed: dict[tuple[str, ...], bytes] = {}
-    read = ImportlibResourcesConfigSource._read_config
+    parsed: dict[str, bytes] = {}
+    load = OmegaConf.load
 
-    def read_again(self: ImportlibResourcesConfigSource, file: Any) -> Any:
-        if not isinstance(file, Path):  # in an archive
-            return read(self, file)
-        key = (self.provider, self.path, str(file), str(file.stat().st_mtime_ns))
-        if key not in parsed:
-            parsed[key] = pickle.dumps(read(self, file))
-        return pickle.loads(parsed[key])
+    def load_again(file: Any) -> Any:
+        if not isinstance(file, TextIOBase):
+            return load(file)
+        text = file.read()
+        if text not in parsed:
+            parsed[text] = pickle.dumps(load(StringIO(text)))
+        return pickle.loads(parsed[text])
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ImportlibResourcesConfigSource, "_read_config", read_again)
+        patch.setattr(OmegaConf, "load", load_again)
         yield
 
 

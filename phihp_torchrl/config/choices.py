@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,9 +29,12 @@ def offer(group: str, name: str, content: Mapping[str, Any]) -> None:
     _OFFERED[group, name] = dict(content)
 
 
-def offered() -> str:
-    """All that is offered, as a text that differs where anything does."""
-    return repr(_OFFERED)
+def offered(words: Sequence[str]) -> str:
+    """What is offered under a name that is in one of ``words``, as a text.
+
+    It is another text where such an offer is another.
+    """
+    return repr({key: _OFFERED[key] for key in _OFFERED if any(key[1] in word for word in words)})
 
 
 def groups() -> set[str]:

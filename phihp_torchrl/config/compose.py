@@ -89,7 +89,7 @@ def compose_yaml(overrides: Sequence[str], config_dir: str | Path | None = None)
         if config_dir is not None:
             return _compose(lines, config_dir)
         chosen, values = _split(lines)
-        composed = copy.deepcopy(_compose_once(tuple(chosen), offered()))
+        composed = copy.deepcopy(_compose_once(tuple(chosen), offered(chosen)))
         ConfigLoaderImpl._apply_overrides_to_config(values, composed)
         return composed
     except (HydraException, OmegaConfBaseException) as error:
