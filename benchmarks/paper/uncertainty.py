@@ -198,9 +198,9 @@ def write_tables(results: Path) -> None:
         + ".\n\nReturns are means over 50 evaluation episodes of a training seed, then over "
         "training seeds, ± half the 95 % interval over training seeds (Student's t). A gain is "
         "taken seed by seed, over the same episodes. An interval that holds 0 shows no gain. "
-        "Where calibration leaves acting to the actor, the agent is shipped as that. Times are wall "
-        "clock on a machine shared with other work, medians over seeds, without what compiling "
-        "takes.\n"
+        "Where calibration leaves acting to the actor, the agent is shipped as that. Times are "
+        "wall clock on a machine shared with other work, medians over seeds, without what "
+        "compiling takes.\n"
     )
     for player, title in (("planner", "The agent as it is shipped"), ("actor", "The actor alone")):
         text += f"\n## {title}\n\n{markdown_table(header, gains(runs, player))}"
