@@ -13,7 +13,13 @@ from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, load_conf
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
-from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, read_run_config, run
+from phihp_torchrl.trainers import (
+    CalibrateConfig,
+    CalibratePhase,
+    calibrate_contest,
+    read_run_config,
+    run,
+)
 from phihp_torchrl.trainers import calibrate as calibrate_module
 from phihp_torchrl.trainers.calibrate_budget import Price, first_episodes
 from phihp_torchrl.trainers.calibrate_ways import calmer, leaving
@@ -152,7 +158,9 @@ def test_in_doubt_more_episodes_are_played_up_to_the_limit(caplog):
     assert phase.final["certain"] is False
     assert "Raise calibrate.max_episodes" in caplog.text
     # The lots are from different starts.
-    assert all(len(set(returns)) == TINY.max_episodes for returns, _ in phase.played.values())
+    assert all(
+        len(set(returns)) == TINY.max_episodes for returns, _ in phase.contest._played.values()
+    )
 
 
 @pytest.mark.usefixtures("restless")
@@ -178,7 +186,7 @@ def test_episodes_are_whole_and_chatter_is_that_of_their_second_half():
     phase = finished(make_agent())
     steps, of = phase.agent.task.max_steps, phase.final
     actor = phase.agent.actor_alone()
-    played = play(actor, phase.world_model, phase._starts[: of["episodes"]], steps=steps)
+    played = play(actor, phase.world_model, phase.contest.starts[: of["episodes"]], steps=steps)
     assert len(played.changes) == steps
     assert of["actor_return"] == pytest.approx(played.total.mean().item(), rel=1e-5)
     late = played.changes[steps // 2 :].mean().item()
@@ -192,7 +200,7 @@ def test_a_plan_that_fails_late_does_not_act(monkeypatch):
         played = play(agent, *arguments, **options)
         return played if agent.planner is None else played._replace(total=played.total - 100.0)
 
-    monkeypatch.setattr(calibrate_module, "play", spoilt)
+    monkeypatch.setattr(calibrate_contest, "play", spoilt)
     phase = finished(make_agent())
     assert phase.acting == "actor"
     assert phase.final["certain"] is True

@@ -1,0 +1,151 @@
+"""The imagined episodes in which ways to plan are compared with each other and with the actor."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from phihp_torchrl.deployment import Agent
+from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.trainers.calibrate_budget import Price, first_episodes
+from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
+from phihp_torchrl.trainers.calibrate_rule import Way
+from phihp_torchrl.trainers.imagined_play import Played, play
+
+# Ways to plan that play whatever they cost; further ones do as far as the budget goes.
+_IN_ANY_CASE = 2
+
+
+class Contest:
+    """Whole episodes from the same starts, with the same noise, for each way to plan.
+
+    The actor plays all of them at once, which costs little, when it is first asked for. A way to
+    plan plays lots of them, when it is told to.
+
+    Args:
+        agent: the agent, whose planner's settings the ways change.
+        world_model: the model to imagine with.
+        config: settings of calibration.
+        starts: first states, ``[config.max_episodes, n]``.
+        seed: seed of the noise of plans.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        world_model: TaskWorldModel,
+        config: CalibrateConfig,
+        starts: Tensor,
+        seed: int,
+    ) -> None:
+        self.agent, self.world_model, self.config = agent, world_model, config
+        self.starts, self.seed, self.price = starts, seed, Price.of(agent)
+        self.ways: dict[str, dict[str, Any]] = {}
+        self.episodes, self.spent = 0, 0.0
+        self._played: dict[str, list[list[float]]] = {}
+
+    def begin(self, ways: Mapping[str, dict[str, Any]]) -> None:
+        """Name the ways to plan, as changes of the planner's settings, the first one first."""
+        self.ways = dict(ways)
+        self.episodes = first_episodes(self.config, self.price, self._longest, len(ways))
+
+    @cached_property
+    def of_actor(self) -> Played:
+        """All episodes of the actor alone."""
+        actor, steps = self.agent.actor_alone(), self.agent.task.max_steps
+        return play(actor, self.world_model, self.starts, steps=steps)
+
+    @property
+    def next_way(self) -> str | None:
+        """The way to plan that has yet to play; none once all have played this lot."""
+        return next((name for name in self.ways if self._missing(name)), None)
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Episodes of plans that are played, and all of this lot and those before."""
+        count = sum(len(returns) for returns, _ in self._played.values())
+        return count, max(count, len(self.ways) * self.episodes)
+
+    def play(self, name: str) -> None:
+        """Let a way to plan play the episodes of this lot."""
+        count, steps = self._missing(name), self.agent.task.max_steps
+        lot = slice(self.episodes - count, self.episodes)
+        assert self.agent.planner_config is not None
+        agent = self.agent.with_planner(replace(self.agent.planner_config, **self.ways[name]))
+        seed = self.seed + lot.start
+        found = play(agent, self.world_model, self.starts[lot], steps=steps, seed=seed)
+        self.spent += self._cost(count, len(found.changes))
+        before = self._played.get(name, [[], []])
+        new = (found.total.tolist(), found.chatter().tolist())
+        self._played[name] = [[*old, *more] for old, more in zip(before, new, strict=True)]
+
+    def double(self) -> bool:
+        """Go on to as many episodes again, if their limit and the budget allow it.
+
+        Returns:
+            Whether they do.
+        """
+        more = min(self.episodes, self.config.max_episodes - self.episodes)
+        following = self.spent * (1 + more / self.episodes)
+        if more < 1 or following > self.config.budget:
+            return False
+        self.episodes += more
+        self.ways = {name: self.ways[name] for name in self._played}
+        return True
+
+    def way(self, name: str) -> Way:
+        """What a way to plan has earned so far."""
+        returns, chatter = self._played[name]
+        return Way(tuple(returns), tuple(chatter), self.ways[name])
+
+    def all_ways(self) -> dict[str, Way]:
+        """What all that have played have earned."""
+        return {name: self.way(name) for name in self._played}
+
+    def late_states(self, count: int) -> Tensor:
+        """States of the second halves of the actor's first episodes, ``[count * episodes, n]``."""
+        episodes, played = self.config.episodes, self.of_actor
+        generator = torch.Generator().manual_seed(self.seed)
+        states = played.states[:, :episodes]
+        share = 0.5 + 0.5 * torch.rand(count, episodes, generator=generator).to(states.device)
+        index = (share * played.lengths[:episodes]).long()[..., None]
+        return states.gather(0, index.expand(-1, -1, states.shape[-1])).flatten(0, 1)
+
+    def actor(self, episodes: int) -> Way:
+        """What the actor earned in the first episodes."""
+        numbers = (self.of_actor.total, self.of_actor.chatter())
+        returns, chatter = (tuple(column[:episodes].tolist()) for column in numbers)
+        return Way(returns, chatter)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a resumed run needs; the actor's episodes are played again."""
+        names = ("ways", "episodes", "spent", "_played")
+        return {name: copy.deepcopy(getattr(self, name)) for name in names}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a :meth:`state_dict`."""
+        for name, value in state.items():
+            setattr(self, name, copy.deepcopy(value))
+
+    @property
+    def _longest(self) -> int:
+        """Steps of the longest of the actor's episodes, as which a plan's are taken to be."""
+        return len(self.of_actor.changes)
+
+    def _missing(self, name: str) -> int:
+        """Episodes that a way has yet to play; none of one that would exceed the budget."""
+        played = self._played.get(name)
+        if played is not None:
+            return self.episodes - len(played[0])
+        optional = list(self.ways).index(name) >= _IN_ANY_CASE
+        dear = self.spent + self._cost(self.episodes, self._longest) > self.config.budget
+        return 0 if optional and dear else self.episodes
+
+    def _cost(self, episodes: int, steps: int) -> float:
+        return steps * self.price.plan(episodes)
