@@ -113,8 +113,9 @@ class CalibratePhase:
             "gain_error": error,
             "chatter": way.mean_chatter,
         }
-        if contest.next_way is None:
-            metrics["acting_planner"] = float(self._choose().acting == "planner")
+        if contest.equal:
+            choice = self._choose()
+            metrics["acting_planner"] = float(choice.acting == "planner")
         return {f"calibrate/{key}": value for key, value in metrics.items()}
 
     def parts(self) -> dict[str, Any]:
@@ -166,11 +167,13 @@ class CalibratePhase:
         return gain.quantile(_PROMISE_SHARE).item() if len(gain) else 0.0
 
     def _choose(self) -> Choice:
-        """Choose, or ask for as many episodes again."""
+        """Choose; where all have played, keep the choice or ask for as many episodes again."""
         contest, ways = self.contest, self.contest.all_ways()
         actor = contest.actor(contest.episodes)
         choice = choose(ways, actor, confidence=self.config.confidence)
-        if choice.certain or not contest.double():
+        if choice.name != next(iter(ways)):
+            contest.close()  # the ways that are left are less calm
+        if contest.next_way is None and (choice.certain or not contest.double()):
             self.final = summary(choice, ways, actor)
             report(self.final)
             if self.path is not None:

@@ -67,6 +67,11 @@ class Contest:
         return next((name for name in self.ways if self._missing(name)), None)
 
     @property
+    def equal(self) -> bool:
+        """Whether all ways that have played at all have played this lot."""
+        return all(len(returns) == self.episodes for returns, _ in self._played.values())
+
+    @property
     def progress(self) -> tuple[int, int]:
         """Episodes of plans that are played, and all of this lot and those before."""
         count = sum(len(returns) for returns, _ in self._played.values())
@@ -96,8 +101,12 @@ class Contest:
         if more < 1 or following > self.config.budget:
             return False
         self.episodes += more
-        self.ways = {name: self.ways[name] for name in self._played}
+        self.close()
         return True
+
+    def close(self) -> None:
+        """Let no further way to plan enter."""
+        self.ways = {name: self.ways[name] for name in self._played}
 
     def way(self, name: str) -> Way:
         """What a way to plan has earned so far."""

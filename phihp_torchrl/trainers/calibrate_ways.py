@@ -36,7 +36,7 @@ def leaving(config: SearchConfig, promise: float, reward: float) -> dict[str, An
 
 
 def calmer(config: SearchConfig, reward: float) -> dict[str, dict[str, Any]]:
-    """Three ways to plan calmly, by name, for an actor that does not rest.
+    """Three ways to plan calmly, by name, the calmest first, for an actor that does not rest.
 
     A price of changes alone leaves the noise of the search: the mean of a few elites of a wide
     Gaussian. So these go on from the previous plan, keep it unless another is better, and look for
