@@ -35,9 +35,9 @@ class CalibratePhase:
 
     A few ways to plan and the actor play whole episodes of the model from the same starts, with the
     same noise, and a rule (:func:`~phihp_torchrl.trainers.calibrate_rule.choose`) chooses. Where
-    the actor rests in the end, and plans promise little beyond it, the one way is a plan that
-    leaves it alone there; else there are the settings as given and calmer ones. More episodes are
-    played while it is in doubt who is to act. No real step is taken.
+    the actor rests in the end, and plans promise little beyond it, the ways are plans that leave it
+    alone there; else there are the settings as given and calmer ones. More episodes are played
+    while it is in doubt who is to act. No real step is taken.
 
     Args:
         agent: the agent, with model, actor and planner; it is not compiled.
@@ -140,9 +140,9 @@ class CalibratePhase:
         played = self.contest.of_actor
         reward = (played.total / played.lengths).abs().mean().item()
         promise = self._promise(self.contest.late_states(_PROMISES))
-        margin = leaving(self.base, promise, reward)
-        if margin and played.chatter().mean() <= _RESTS and promise <= _LITTLE * reward:
-            return {"leaving": margin}
+        alone = leaving(self.base, promise, reward)
+        if alone and played.chatter().mean() <= _RESTS and promise <= _LITTLE * reward:
+            return alone
         return {"given": {}, **calmer(self.base, reward)}
 
     @torch.no_grad()
@@ -171,8 +171,10 @@ class CalibratePhase:
         contest, ways = self.contest, self.contest.all_ways()
         actor = contest.actor(contest.episodes)
         choice = choose(ways, actor, confidence=self.config.confidence)
-        if choice.name != next(iter(ways)):
-            contest.close()  # the ways that are left are less calm
+        plan, first = ways[choice.name], next(iter(ways))
+        rests = choice.certain and choice.gain >= 0.0 and plan.mean_chatter <= _RESTS
+        if rests or choice.name != first:  # the ways that are left are less calm than this one
+            contest.close()
         if contest.next_way is None and (choice.certain or not contest.double()):
             self.final = summary(choice, ways, actor)
             report(self.final)

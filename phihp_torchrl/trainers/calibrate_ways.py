@@ -10,29 +10,41 @@ from phihp_torchrl.planners import SearchConfig
 
 # Share of a step's reward below which a promise is rounding.
 _NOTHING = 1e-3
+# A search that goes on from the previous plan, and keeps it unless another is better.
+_STANDING = {"noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
 # Std of the search near the previous plan, in units of the half-range.
 _NEAR, _NEARER = 0.3, 0.1
 
 
-def leaving(config: SearchConfig, promise: float, reward: float) -> dict[str, Any]:
-    """A margin of twice what plans promise where the actor rests, which leaves it alone there.
+def leaving(config: SearchConfig, promise: float, reward: float) -> dict[str, dict[str, Any]]:
+    """Two ways to plan that leave the actor alone where it rests, by name.
+
+    Their margin is twice what plans promise there. A plan that leaves the actor all the same may
+    find it worth its while to go on; the second way keeps it from that by a price of changes.
 
     Args:
         config: the planner's settings.
-        promise: what its plans promise beyond the actor where that has settled, in units of return.
-        reward: mean absolute reward of a step.
+        promise: what its plans promise beyond the actor where that rests, in units of return.
+        reward: mean absolute reward of a step, the price of a full change of the action.
 
     Returns:
         The changes; none where plans promise nothing, or where a planner has no margin.
 
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig
-        >>> leaving(CEMConfig(), 1.0, 1.0), leaving(CEMConfig(), 0.0, 1.0)
-        ({'actor_margin': 2.0}, {})
+        >>> ways = leaving(CEMConfig(warm_start=True, noise_beta=2.0), 1.0, 0.5)
+        >>> ways["leaving"]
+        {'actor_margin': 2.0}
+        >>> ways["priced"]
+        {'change_cost': 0.5, 'keep_incumbent': True, 'actor_margin': 2.0}
+        >>> leaving(CEMConfig(), 0.0, 1.0)
+        {}
     """
-    if promise < _NOTHING * reward:
+    margin = _fitting(config, {"actor_margin": _round(2 * promise)})
+    if promise < _NOTHING * reward or not margin:
         return {}
-    return _fitting(config, {"actor_margin": _round(2 * promise)})
+    priced = _fitting(config, {"change_cost": _round(reward), **_STANDING, **margin})
+    return {"leaving": margin, **({"priced": priced} if priced else {})}
 
 
 def calmer(config: SearchConfig, reward: float) -> dict[str, dict[str, Any]]:
@@ -50,12 +62,11 @@ def calmer(config: SearchConfig, reward: float) -> dict[str, dict[str, Any]]:
         >>> [(name, way["change_cost"], way["init_std"]) for name, way in ways.items()]
         [('calm', 1.0, 0.1), ('mild', 0.1, 0.1), ('loose', 0.33, 0.3)]
     """
-    standing = {"noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
     kinds = (("calm", 1.0, _NEARER), ("mild", 0.1, _NEARER), ("loose", 1 / 3, _NEAR))
     ways = {}
     for name, share, near in kinds:
         price, std = share * reward, min(near, config.init_std)
-        changes = _fitting(config, {"change_cost": _round(price), **standing, "init_std": std})
+        changes = _fitting(config, {"change_cost": _round(price), **_STANDING, "init_std": std})
         if changes:
             ways[name] = changes
     return ways
