@@ -36,7 +36,7 @@ class CalibrateConfig:
     episodes: int = 6
     confidence: float = 2.0
     max_episodes: int = 48
-    budget: int = 30_000_000
+    budget: int = 36_000_000
 
     def __post_init__(self) -> None:
         check_fields(self)
