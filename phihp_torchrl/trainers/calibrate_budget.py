@@ -56,7 +56,7 @@ class Price:
         return total / getattr(planner, "replan_every", 1)
 
 
-def first_episodes(config: CalibrateConfig, price: Price, steps: int, ways: int) -> int:
+def first_episodes(config: CalibrateConfig, price: Price, steps: float, ways: int) -> int:
     """Episodes that each way of planning plays before there is doubt.
 
     Args:

@@ -53,7 +53,7 @@ class Contest:
     def begin(self, ways: Mapping[str, dict[str, Any]]) -> None:
         """Name the ways to plan, as changes of the planner's settings, the first one first."""
         self.ways = dict(ways)
-        self.episodes = first_episodes(self.config, self.price, self._longest, len(ways))
+        self.episodes = first_episodes(self.config, self.price, self._length, len(ways))
 
     @cached_property
     def of_actor(self) -> Played:
@@ -143,9 +143,9 @@ class Contest:
             setattr(self, name, copy.deepcopy(value))
 
     @property
-    def _longest(self) -> int:
-        """Steps of the longest of the actor's episodes, as which a plan's are taken to be."""
-        return len(self.of_actor.changes)
+    def _length(self) -> float:
+        """Mean length of the actor's episodes, as long as which a plan's are taken to be."""
+        return self.of_actor.lengths.double().mean().item()
 
     def _missing(self, name: str) -> int:
         """Episodes that a way has yet to play; none of one that would exceed the budget."""
@@ -153,8 +153,8 @@ class Contest:
         if played is not None:
             return self.episodes - len(played[0])
         optional = list(self.ways).index(name) >= _IN_ANY_CASE
-        dear = self.spent + self._cost(self.episodes, self._longest) > self.config.budget
+        dear = self.spent + self._cost(self.episodes, self._length) > self.config.budget
         return 0 if optional and dear else self.episodes
 
-    def _cost(self, episodes: int, steps: int) -> float:
+    def _cost(self, episodes: int, steps: float) -> float:
         return steps * self.price.plan(episodes)

@@ -12,7 +12,7 @@ import torch
 # Of the plan's gain over the actor, what smoothness may cost.
 _SHARE = 0.1
 # And of the actor's return, if that is more: it is less than anybody would notice.
-_TRIFLE = 1e-3
+_TRIFLE = 3e-3
 # Chatter of the smoother plan, as a share of the other's; and the least difference of the two.
 _SMOOTHER, _NOTICEABLE = 2 / 3, 0.01
 
@@ -92,7 +92,8 @@ def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> C
 
     Of those that are clearly smoother than what stays, with at most two thirds of its chatter, the
     smoothest takes its place that does not earn less, by over one standard error, than what
-    smoothness may cost: a tenth of the gain over the actor, or a thousandth of the actor's return.
+    smoothness may cost: a tenth of the gain over the actor, or 0.3 % of the actor's return. The
+    benefit of doubt ends where the loss looks twice as large as that.
 
     The plan that is chosen acts if it earns more than the actor. If it earns less, but not by over
     one standard error, it acts unless the actor is clearly smoother: a plan looks further than its
@@ -128,7 +129,7 @@ def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> C
     calm = {
         other: way.mean_chatter
         for other, way in ways.items()
-        if way.smoother_than(best) and sum(way.ahead_of(best)) >= -allowed
+        if way.smoother_than(best) and _costs_at_most(allowed, way, best)
     }
     name = min(calm, key=calm.__getitem__, default=name)
     plan = ways[name]
@@ -138,6 +139,11 @@ def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> C
     acts = plan.smoother_than(actor) if same else gain > 0.0 or close
     certain = same or abs(gain) > confidence * error
     return Choice(name, "planner" if acts else "actor", certain, gain, error)
+
+
+def _costs_at_most(allowed: float, way: Way, best: Way) -> bool:
+    ahead, error = way.ahead_of(best)
+    return ahead >= -allowed - min(error, allowed)
 
 
 def _behind(plan: Way, actor: Way, confidence: float) -> bool:
