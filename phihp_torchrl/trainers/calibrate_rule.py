@@ -116,13 +116,11 @@ def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> C
         >>> choice.name, choice.acting, choice.certain
         ('calm', 'planner', True)
     """
+    behind = {name: _behind(way, actor, confidence) for name, way in ways.items()}
     name, *others = ways
     for other in others:
         ahead, error = ways[other].ahead_of(ways[name])
-        rescues = _behind(ways[name], actor, confidence) and not _behind(
-            ways[other], actor, confidence
-        )
-        if ahead > confidence * error or rescues:
+        if ahead > confidence * error or (behind[name] and not behind[other]):
             name = other
     best = ways[name]
     allowed = max(_SHARE * best.ahead_of(actor)[0], _TRIFLE * abs(actor.mean_return))
@@ -135,7 +133,7 @@ def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> C
     plan = ways[name]
     gain, error = plan.ahead_of(actor)
     same = gain == error == 0.0
-    close = not (_behind(plan, actor, confidence) or actor.smoother_than(plan))
+    close = not (behind[name] or actor.smoother_than(plan))
     acts = plan.smoother_than(actor) if same else gain > 0.0 or close
     certain = same or abs(gain) > confidence * error
     return Choice(name, "planner" if acts else "actor", certain, gain, error)
