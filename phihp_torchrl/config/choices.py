@@ -30,11 +30,17 @@ def offer(group: str, name: str, content: Mapping[str, Any]) -> None:
 
 
 def offered(words: Sequence[str]) -> str:
-    """What is offered under a name that is in one of ``words``, as a text.
+    """What is offered, as a text that differs where anything does that ``words`` may choose.
 
-    It is another text where such an offer is another.
+    Of tasks, of which there may be many, those count whose name is in one of the words. All other
+    offers do, for settings may choose one without a word.
     """
-    return repr({key: _OFFERED[key] for key in _OFFERED if any(key[1] in word for word in words)})
+    found = {
+        (group, name): content
+        for (group, name), content in _OFFERED.items()
+        if group != "task" or any(name in word for word in words)
+    }
+    return repr(found)
 
 
 def groups() -> set[str]:
