@@ -59,7 +59,7 @@ def _undrawn() -> Iterator[None]:
 def _parsed_once() -> Iterator[None]:
     """A YAML file is parsed once, not by each of the hundreds of compositions.
 
-    That is half of the time of one. Every reader gets an object of its own.
+    Every reader gets an object of its own.
     """
     parsed: dict[str, bytes] = {}
     load = OmegaConf.load

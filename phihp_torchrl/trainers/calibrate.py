@@ -12,7 +12,6 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from phihp_torchrl.deployment import Agent
-from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.planners import SearchConfig, score_sequences
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_contest import Contest
@@ -64,16 +63,14 @@ class CalibratePhase:
     def __init__(
         self, agent: Agent, config: CalibrateConfig, *, seed: int, path: Path | None = None
     ) -> None:
-        assert agent.dynamics is not None
         assert agent.planner_config is not None
         self.agent, self.config, self.seed, self.path = agent, config, seed, path
         self.base: SearchConfig = agent.planner_config
-        self.world_model = TaskWorldModel(agent.task, agent.dynamics)
         self.final: dict[str, Any] = {}
         generator = torch.Generator().manual_seed(seed)
         starts = agent.task.sample_start([config.max_episodes], generator)
         starts = starts.to(next(agent.parameters()).device)
-        self.contest = Contest(agent, self.world_model, config, starts, seed)
+        self.contest = Contest(agent, config, starts, seed)
 
     @property
     def done(self) -> bool:
@@ -151,7 +148,8 @@ class CalibratePhase:
         planner, settings = self.agent.with_planner(self.base).planner, self.base
         assert planner is not None
         planner.generator = torch.Generator(state.device).manual_seed(self.seed)
-        seen = TensorDict(observation=self.world_model.observe(state), batch_size=[len(state)])
+        observation = self.contest.world_model.observe(state)
+        seen = TensorDict(observation=observation, batch_size=[len(state)])
         none = state.new_zeros(settings.planning_horizon, len(state), self.agent.task.action_dim)
         own, _ = score_sequences(
             state,
@@ -173,7 +171,7 @@ class CalibratePhase:
         choice = choose(ways, actor, confidence=self.config.confidence)
         plan, first = ways[choice.name], next(iter(ways))
         rests = choice.certain and choice.gain >= 0.0 and plan.mean_chatter <= _RESTS
-        if rests or choice.name != first:  # the ways that are left are less calm than this one
+        if rests or choice.name != first:  # this is smooth already, or the calmest that is taken
             contest.close()
         if contest.next_way is None and (choice.certain or not contest.double()):
             self.final = summary(choice, ways, actor)

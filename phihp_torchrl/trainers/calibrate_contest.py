@@ -29,8 +29,7 @@ class Contest:
     plan plays lots of them, when it is told to.
 
     Args:
-        agent: the agent, whose planner's settings the ways change.
-        world_model: the model to imagine with.
+        agent: the agent, whose planner's settings the ways change, and in whose model they play.
         config: settings of calibration.
         starts: first states, ``[config.max_episodes, n]``.
         seed: seed of the noise of plans.
@@ -39,12 +38,13 @@ class Contest:
     def __init__(
         self,
         agent: Agent,
-        world_model: TaskWorldModel,
         config: CalibrateConfig,
         starts: Tensor,
         seed: int,
     ) -> None:
-        self.agent, self.world_model, self.config = agent, world_model, config
+        assert agent.dynamics is not None
+        self.agent, self.config = agent, config
+        self.world_model = TaskWorldModel(agent.task, agent.dynamics)
         self.starts, self.seed, self.price = starts, seed, Price.of(agent)
         self.ways: dict[str, dict[str, Any]] = {}
         self.episodes, self.spent = 0, 0.0
@@ -58,8 +58,7 @@ class Contest:
     @cached_property
     def of_actor(self) -> Played:
         """All episodes of the actor alone."""
-        actor, steps = self.agent.actor_alone(), self.agent.task.max_steps
-        return play(actor, self.world_model, self.starts, steps=steps)
+        return play(self.agent.actor_alone(), self.world_model, self.starts)
 
     @property
     def next_way(self) -> str | None:
@@ -79,12 +78,12 @@ class Contest:
 
     def play(self, name: str) -> None:
         """Let a way to plan play the episodes of this lot."""
-        count, steps = self._missing(name), self.agent.task.max_steps
+        count = self._missing(name)
         lot = slice(self.episodes - count, self.episodes)
         assert self.agent.planner_config is not None
         agent = self.agent.with_planner(replace(self.agent.planner_config, **self.ways[name]))
         seed = self.seed + lot.start
-        found = play(agent, self.world_model, self.starts[lot], steps=steps, seed=seed)
+        found = play(agent, self.world_model, self.starts[lot], seed=seed)
         self.spent += self._cost(count, len(found.changes))
         before = self._played.get(name, [[], []])
         new = (found.total.tolist(), found.chatter().tolist())

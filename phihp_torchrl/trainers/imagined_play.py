@@ -39,16 +39,13 @@ class Played(NamedTuple):
 
 
 @torch.no_grad()
-def play(
-    agent: Agent, world_model: TaskWorldModel, state: Tensor, *, steps: int, seed: int = 0
-) -> Played:
-    """Let an agent play imagined episodes until ``steps`` steps, or until all are over.
+def play(agent: Agent, world_model: TaskWorldModel, state: Tensor, *, seed: int = 0) -> Played:
+    """Let an agent play whole imagined episodes.
 
     Args:
         agent: the agent.
         world_model: the model to imagine with.
         state: first states, ``[N, n]``.
-        steps: steps of an episode at most.
         seed: seed of the noise of its plans.
     """
     if agent.planner is not None:
@@ -59,7 +56,7 @@ def play(
     last: Tensor | None = None
     alive = torch.ones(len(state), dtype=torch.bool, device=state.device)
     total, lengths = torch.zeros_like(state[:, 0]), torch.zeros_like(alive, dtype=torch.int64)
-    while len(changes) < steps and alive.any():
+    while len(changes) < world_model.task.max_steps and alive.any():
         seen = TensorDict(
             observation=world_model.observe(state),
             is_init=torch.full([len(state), 1], last is None, device=state.device),

@@ -189,7 +189,7 @@ def test_episodes_are_whole_and_chatter_is_that_of_their_second_half():
     phase = finished(make_agent())
     steps, of = phase.agent.task.max_steps, phase.final
     actor = phase.agent.actor_alone()
-    played = play(actor, phase.world_model, phase.contest.starts[: of["episodes"]], steps=steps)
+    played = play(actor, phase.contest.world_model, phase.contest.starts[: of["episodes"]])
     assert len(played.changes) == steps
     assert of["actor_return"] == pytest.approx(played.total.mean().item(), rel=1e-5)
     late = played.changes[steps // 2 :].mean().item()
