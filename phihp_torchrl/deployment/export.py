@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from phihp_torchrl.compilation import compile_ahead
 from phihp_torchrl.deployment.export_modules import ExportModule
 from phihp_torchrl.deployment.exported import Act, import_onnx, load_aoti, load_onnx
 from phihp_torchrl.deployment.manifest import Manifest
@@ -33,9 +34,7 @@ def export_aoti(module: ExportModule, path: str | Path) -> Act:
         torch.Size([1])
     """
     path = Path(path)
-    with torch.no_grad():
-        program = torch.export.export(module, module.example())
-        torch._inductor.aoti_compile_and_package(program, package_path=str(path))
+    compile_ahead(module, module.example(), path)
     Manifest.of(module, path).write(path)
     return load_aoti(path)
 

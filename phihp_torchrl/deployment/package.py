@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
+from phihp_torchrl.compilation import compile_ahead
 from phihp_torchrl.deployment.manifest import platform_name, processor, torch_version
 from phihp_torchrl.deployment.reading import AgentError, read_json
 from phihp_torchrl.origin import package_version
@@ -58,9 +59,7 @@ def write_package(agent: Agent, path: Path) -> None:
     if reason := planner.why_not_compiled():
         raise AgentError(f"packaged: expected a plan that compiles, but {reason}.")
     arguments, _ = planner.example_call(agent.example())
-    with torch.no_grad():
-        program = torch.export.export(_Plan(planner, arguments), _tensors(arguments))
-        torch._inductor.aoti_compile_and_package(program, package_path=str(path))
+    compile_ahead(_Plan(planner, arguments), _tensors(arguments), path)
 
 
 def use_package(agent: Agent, path: Path) -> None:

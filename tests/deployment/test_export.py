@@ -33,6 +33,8 @@ from .agent_parts import observations as observe
 TINY = CEMConfig(
     planning_horizon=2, optim_steps=2, num_candidates=8, top_k=2, num_policy_candidates=2
 )
+# For what takes a minute to compile: a plan of more steps goes the same way.
+SMALLEST = replace(TINY, planning_horizon=1, optim_steps=1)
 
 
 def make_agent(name="pendulum", config=TINY, **options):
@@ -61,8 +63,7 @@ def test_module_is_the_planner(task):
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_aot_inductor(tmp_path):
-    """With one step of the search: a packaged plan has more, and goes the same way."""
-    agent = make_agent(config=replace(TINY, optim_steps=1))
+    agent = make_agent(config=SMALLEST)
     module = PlanModule(agent)
     act = export_aoti(module, tmp_path / "plan.pt2")
     assert (tmp_path / "plan.pt2").is_file()
@@ -76,7 +77,7 @@ def test_aot_inductor(tmp_path):
 def test_onnx(tmp_path):
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
-    agent = make_agent()
+    agent = make_agent(config=SMALLEST)
     module = PlanModule(agent)
     act = export_onnx(module, tmp_path / "plan.onnx")
     assert largest_differences(act, module, observations(agent)).max() < 1e-4

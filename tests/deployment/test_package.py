@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,9 @@ CONFIG = CEMConfig(
     warm_start=True,
 )
 
+# For what takes a minute to compile: a plan of more steps goes the same way.
+SMALLEST = replace(CONFIG, planning_horizon=1, optim_steps=1, warm_start=False)
+
 
 def make(**changes):
     torch.manual_seed(0)
@@ -41,7 +45,7 @@ def saved(tmp_path_factory):
     """
     programs, directory = {}, tmp_path_factory.mktemp("saved")
 
-    def compile_and_package(program, package_path):
+    def compile_and_package(program, *, package_path, inductor_configs):
         Path(package_path).write_text("a package")
         programs["a package"] = program.module()
 
@@ -196,7 +200,7 @@ def test_an_agent_stays_eager_where_the_other_process_fails(monkeypatch, caplog)
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_another_process_compiles_the_plan():
-    agent = make()
+    agent = make(planner_config=SMALLEST)
     expected = act(agent)
     found = agent.warm_up(background=True)
     torch.testing.assert_close(act(agent), expected)  # eagerly, in the meantime
