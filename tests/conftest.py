@@ -24,7 +24,7 @@ SEED = 0
 torch.set_num_threads(1)
 
 # Compiling and first calls are slow, so no deadline; the same examples on every run.
-settings.register_profile("phihp", deadline=None, derandomize=True)
+settings.register_profile("phihp", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("phihp")
 
 

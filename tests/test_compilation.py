@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import weakref
 
 import pytest
@@ -127,3 +128,34 @@ def test_a_graph_that_would_break_fails():
 
 def test_not_enabled():
     assert compile_graph(abs, enabled=False) is abs
+
+
+COMPILING = """
+import json, multiprocessing, os
+os.environ["TORCHINDUCTOR_CACHE_DIR"] = {cache!r}
+import torch
+from phihp_torchrl.compilation import compile_graph
+fork = multiprocessing.get_context("fork")
+together = fork.Barrier(2)
+
+def compiling():
+    together.wait(60)
+    found = compile_graph(lambda x: (x @ x).relu().sum(0))(torch.ones(4, 4))
+    os.write(1, (json.dumps(found.tolist()) + chr(10)).encode())
+
+both = [fork.Process(target=compiling) for _ in range(2)]
+for process in both:
+    process.start()
+for process in both:
+    process.join()
+assert [process.exitcode for process in both] == [0, 0]
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_may_compile_with_one_cache_at_the_same_time(tmp_path, forks):
+    forks.start(COMPILING.format(cache=str(tmp_path / "cache")))
+    lines, code = forks.end()
+    assert code == 0
+    assert any((tmp_path / "cache").iterdir())
+    assert [json.loads(line) for line in lines] == [[16.0] * 4] * 2

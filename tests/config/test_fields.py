@@ -70,7 +70,7 @@ def is_plain(value: Any) -> bool:
     return value is None or type(value) in (bool, int, str) or is_dataclass(value)
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.sampled_from(FIELDS), HOSTILE)
 def test_a_value_is_refused_by_name_or_is_plain_and_finite(chosen: tuple, value: Any) -> None:
     cls, f = chosen

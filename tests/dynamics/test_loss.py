@@ -270,7 +270,7 @@ def test_errors_name_the_argument(options, name):
 SHAPES = st.lists(st.integers(0, 3), max_size=3)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(batch=st.lists(st.integers(0, 3), max_size=2), other=SHAPES, number=st.integers(0, 3))
 def test_transitions_of_any_shape_give_a_number_or_are_refused_by_name(batch, other, number):
     """A shape that broadcasts would give a wrong number without a word."""

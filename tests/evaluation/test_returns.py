@@ -201,7 +201,7 @@ def test_summary_is_numbers():
 SIZES = st.lists(st.sampled_from([1, 2, 3]), max_size=3)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(shape=SIZES, in_env=st.booleans())
 def test_an_action_of_another_shape_is_refused_by_name(shape, in_env):
     """It would break within the world, or be spread over all episodes."""

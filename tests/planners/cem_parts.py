@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import torch
-from points import ZEROS, point_problem
 
-from phihp_torchrl.compilation import compile_graph
-from phihp_torchrl.planners import CEMConfig, candidates, cem_plan, score_sequences
+from phihp_torchrl.planners import CEMConfig, candidates, score_sequences
 
 VARIANTS = [
     {},
@@ -45,15 +43,3 @@ def spy_on_scores(monkeypatch):
 
     monkeypatch.setattr(candidates, "score_sequences", spy)
     return seen
-
-
-@torch.no_grad()
-def compiled_and_eager():
-    """The actions of a small plan, of compiled code and of eager."""
-    chosen = settings(planning_horizon=1, optim_steps=1, num_candidates=4, top_k=2)
-    problem, noise = point_problem(), draw(chosen)
-
-    def plan(observation):
-        return cem_plan(observation, noise, problem=problem, settings=chosen).actions
-
-    return [function(ZEROS).tolist() for function in (compile_graph(plan), plan)]

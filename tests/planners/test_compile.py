@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 
 import pytest
@@ -71,37 +70,6 @@ def test_compiled_by_inductor_equals_eager():
     noise = noise_for(eager)
     actions = [planner.planning(tensordict, noise) for planner in (eager, compiled)]
     torch.testing.assert_close(*actions, atol=1e-4, rtol=1e-4)
-
-
-COMPILING = """
-import json, multiprocessing, os
-os.environ["TORCHINDUCTOR_CACHE_DIR"] = {cache!r}
-from planners.cem_parts import compiled_and_eager
-fork = multiprocessing.get_context("fork")
-together = fork.Barrier(2)
-
-def compiling():
-    together.wait(60)
-    os.write(1, (json.dumps(compiled_and_eager()) + chr(10)).encode())
-
-both = [fork.Process(target=compiling) for _ in range(2)]
-for process in both:
-    process.start()
-for process in both:
-    process.join()
-assert [process.exitcode for process in both] == [0, 0]
-"""
-
-
-@pytest.mark.slow
-def test_two_processes_may_compile_with_one_cache_at_the_same_time(tmp_path, forks):
-    forks.start(COMPILING.format(cache=str(tmp_path / "cache")))
-    (first, second), code = forks.end()
-    assert code == 0
-    assert any((tmp_path / "cache").iterdir())
-    assert first == second
-    found, expected = (torch.tensor(part) for part in json.loads(first))
-    torch.testing.assert_close(found, expected)
 
 
 def test_what_cannot_compile_says_so(caplog):

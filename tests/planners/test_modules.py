@@ -40,7 +40,7 @@ class Shaped(nn.Module):
 SIZES = st.lists(st.sampled_from(["rows", 1, 2]), min_size=0, max_size=4)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(SIZES.filter(lambda shape: shape.count("rows") == 1), st.sampled_from(["tensor", "env"]))
 def test_values_of_any_shape_are_right_or_refused(shape, backend):
     _, env, actor, _ = task_parts("pendulum")
@@ -162,7 +162,7 @@ def test_discrete_actions_are_refused_whatever_their_dtype(dtype):
 LIMIT = st.one_of(st.just(torch.inf), st.just(torch.finfo(torch.float32).max), st.floats(-99, 99))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(low=LIMIT.map(lambda x: -x), high=LIMIT)
 def test_samples_of_any_bounds_are_inside_them_and_differ(low, high):
     if not low + 0.1 < high:

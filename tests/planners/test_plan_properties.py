@@ -101,7 +101,7 @@ both = pytest.mark.parametrize("config", [CEMConfig, MPPIConfig])
 
 @both
 @given(st.data(), limits(), SEEDS)
-@examples(max_examples=60)
+@examples(max_examples=30)
 def test_plans_stay_in_bounds(config, data, bounds, seed):
     s = data.draw(searches(config))
     problem = point_problem(lambda observation: 100 * observation, flat_value, limits=bounds)
@@ -114,7 +114,7 @@ def test_plans_stay_in_bounds(config, data, bounds, seed):
 
 @both
 @given(st.data(), limits(), SEEDS)
-@examples(max_examples=60)
+@examples(max_examples=30)
 def test_a_batch_planned_at_once_is_its_rows_planned_alone(config, data, bounds, seed):
     s = data.draw(searches(config))
     problem = point_problem(half_way, flat_value, limits=bounds, wall=4.0)
@@ -127,7 +127,7 @@ def test_a_batch_planned_at_once_is_its_rows_planned_alone(config, data, bounds,
 
 
 @given(searches(CEMConfig, select="best"), limits(), SEEDS)
-@examples(max_examples=60)
+@examples(max_examples=30)
 def test_the_best_plan_is_never_beaten_by_its_own_candidates(s, bounds, seed):
     problem = point_problem(half_way, flat_value, limits=bounds, wall=4.0)
     with pytest.MonkeyPatch.context() as patch:
@@ -138,7 +138,7 @@ def test_the_best_plan_is_never_beaten_by_its_own_candidates(s, bounds, seed):
 
 @both
 @given(st.data(), limits(), SEEDS)
-@examples(max_examples=60)
+@examples(max_examples=30)
 def test_no_plan_is_beaten_by_the_actors_own_sequence(config, data, bounds, seed):
     """Of CEM where it is told to compare; the best elite of MPPI, whose actor always competes."""
     fixed = {"compare_with_actor": True} if config is CEMConfig else {}
@@ -164,7 +164,7 @@ class InUnits(Point):
 
 @both
 @given(st.data(), limits(), SEEDS)
-@examples(max_examples=60)
+@examples(max_examples=30)
 def test_bounds_are_only_a_unit_of_measure(config, data, bounds, seed):
     """The same problem in other units has the same plan, in those units."""
     s = data.draw(searches(config))
