@@ -24,6 +24,7 @@ from phihp_torchrl.dynamics.prepared import PreparedModel
 from phihp_torchrl.dynamics.prior import PhysicsPrior, perturbed_constants
 from phihp_torchrl.dynamics.ranks import signed_rank
 from phihp_torchrl.dynamics.residual import ACTIVATIONS, ResidualMLP
+from phihp_torchrl.dynamics.restarts import fit_from_other_weights
 from phihp_torchrl.dynamics.solver_choice import AUTO, SOLVERS, fit_solver
 from phihp_torchrl.dynamics.under_way import with_registers
 from phihp_torchrl.dynamics.world_model import TaskWorldModel

@@ -19,6 +19,7 @@ from phihp_torchrl.dynamics import (
     DynamicsLoss,
     FitConfig,
     FitReport,
+    HybridDynamics,
     constants_covariance,
     fit,
     split,
@@ -31,7 +32,13 @@ from phihp_torchrl.trainers.exploration import Exploration
 from phihp_torchrl.trainers.lateness import Lateness
 from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
 from phihp_torchrl.trainers.model_doubts import Doubts
-from phihp_torchrl.trainers.model_fit import chooses_solver, fit_choosing, measures, solver_number
+from phihp_torchrl.trainers.model_fit import (
+    chooses_solver,
+    fit_again,
+    fit_choosing,
+    measures,
+    solver_number,
+)
 from phihp_torchrl.trainers.phases import Phase, register_phase
 from phihp_torchrl.trainers.real_data import RealData, Taken, collected_return, replay_batch
 from phihp_torchrl.worlds import make_world
@@ -93,6 +100,7 @@ class ModelTrainer:
         """What saves the run; it is called when there are new real steps."""
         # Steps not yet fitted, those left out, and those that a failure has kept from being taken.
         self._new, self._dropped, self._missing = 0, 0, 0
+        self._others: list[dict[str, Tensor]] = []  # parameters that fit the data about as well
         self._doubts = Doubts()
         self._found: Actuator | None = None
         seed_of_env = self._draw_seed()
@@ -153,6 +161,15 @@ class ModelTrainer:
     def parts(self) -> dict[str, Any]:
         """Return the model, as an argument of :class:`~phihp_torchrl.Agent`."""
         return {"dynamics": self.dynamics}
+
+    def others(self) -> list[HybridDynamics]:
+        """Other models that describe the real data about as well, as far as restarts found any."""
+        found = []
+        for parameters in self._others:
+            other = copy.deepcopy(self.dynamics)
+            other.load_state_dict(parameters)
+            found.append(other)
+        return found
 
     def advance(self) -> dict[str, float]:
         """Collect once and fit once; returns metrics."""
@@ -237,6 +254,10 @@ class ModelTrainer:
         if self._finds_actuator(report):
             train, held_out, blocks = split(self.data)
             report = self._fit(train, held_out, self.config.fit)
+        if self._has_all:
+            report, self._others = fit_again(
+                self.loss, report, self.initial, train, held_out, self.config, self.generator
+            )
         if config.method != "multiple_shooting" and report.held_out_error > 1e-4:
             self._doubts.of_noise(self.loss, train)
         return measures(self.loss, report, train, blocks)
@@ -278,6 +299,7 @@ class ModelTrainer:
             "dynamics": self.dynamics.state_dict(),
             "initial": self.initial,
             "loss": {name: buffer for name, buffer in self.loss.named_buffers(recurse=False)},
+            "others": list(self._others),
             "data": None if self.data is None else self.data.to_dict(),
             "solver": solver_number(self.loss) if self.config.integrator == AUTO else None,
             "actuator": None if self._found is None else self._found.config,
@@ -296,6 +318,7 @@ class ModelTrainer:
         self.initial = dict(state["initial"])
         for name, value in state["loss"].items():
             self.loss.get_buffer(name).copy_(value)
+        self._others = [dict(parameters) for parameters in state.get("others", ())]
         data = state["data"]
         self.data = None if data is None else TensorDict(data).auto_batch_size_(1)
         self.lateness.open &= data is None or "step_count" in data

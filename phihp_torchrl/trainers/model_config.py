@@ -70,6 +70,9 @@ class ModelConfig:
         warm_start: whether a fit starts from the previous one. The fits between the first and the
             last then keep the final λ, and take at most refit_steps.
         refit_steps: largest number of steps of such a fit; the first and the last fit take all.
+        restarts: fits from other first weights of the residual after the last one, of which the
+            best by held-out error is kept; only where that one's error leaves something to gain,
+            and by least squares.
         fit: how the model is fitted.
         collect: how real data are collected.
 
@@ -97,6 +100,7 @@ class ModelConfig:
     tau_ph: float = 1e3
     warm_start: bool = True
     refit_steps: int = 15
+    restarts: int = 2
     fit: FitConfig = field(default_factory=FitConfig)
     collect: CollectConfig = field(default_factory=CollectConfig)
 
@@ -107,6 +111,7 @@ class ModelConfig:
         if self.steps_per_iteration is not None:
             check_count(self, "steps_per_iteration")
         check_count(self, "refit_steps", "ensemble")
+        check_count(self, "restarts", least=0)
         if self.ensemble > _MOST_MEMBERS:
             raise ConfigError("ensemble", f"expected at most {_MOST_MEMBERS}, got {self.ensemble}.")
         if self.ensemble > 1 and self.kind not in ("hybrid", "data_driven"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 
 import torch
 from tensordict import TensorDict
@@ -13,15 +14,22 @@ from phihp_torchrl.dynamics import (
     BLOCK,
     SOLVERS,
     DynamicsLoss,
+    EnsembleResidual,
     FitConfig,
     FitReport,
     PhysicsPrior,
+    ResidualMLP,
+    fit_from_other_weights,
     fit_solver,
     rollout_error,
 )
 from phihp_torchrl.trainers.model_config import ModelConfig
 
 _log = logging.getLogger(__name__)
+
+# Held-out error, a mean of squares in units of one-step changes, below which no fit is better in a
+# way that a plan would notice.
+_EXACT = 1e-8
 
 
 def chooses_solver(config: ModelConfig) -> bool:
@@ -51,6 +59,54 @@ def fit_choosing(
         solver = loss.dynamics.integrator
         _log.info("The model is integrated by %s (held-out errors: %s).", solver, tried)
     return report
+
+
+def fit_again(
+    loss: DynamicsLoss,
+    report: FitReport,
+    initial: Mapping[str, Tensor],
+    train: TensorDict,
+    held_out: TensorDict,
+    config: ModelConfig,
+    generator: torch.Generator,
+) -> tuple[FitReport, list[dict[str, Tensor]]]:
+    """Fit from other first weights too, where the settings say so and there is something to gain.
+
+    Args:
+        loss: the loss of the fitted model.
+        report: what its fit reports.
+        initial: the parameters before the first fit.
+        train: transitions to fit.
+        held_out: transitions by which fits are compared.
+        config: settings of the phase.
+        generator: source of first weights and mini-batches.
+
+    Returns:
+        As :func:`~phihp_torchrl.dynamics.fit_from_other_weights`.
+    """
+    residual = loss.dynamics.residual
+    single = isinstance(residual, ResidualMLP) and not isinstance(residual, EnsembleResidual)
+    quick = config.fit.method != "adam"
+    if not (config.restarts and single and quick) or report.held_out_error <= _EXACT:
+        return report, []
+    found, others = fit_from_other_weights(
+        loss,
+        report,
+        initial,
+        train,
+        held_out,
+        config.fit,
+        generator,
+        restarts=config.restarts,
+    )
+    if found.held_out_error < report.held_out_error:
+        _log.info(
+            "A fit from other first weights has a held-out error of %.2g, where the one that went "
+            "on from earlier fits had %.2g; it is kept.",
+            found.held_out_error,
+            report.held_out_error,
+        )
+    return found, others
 
 
 def solver_number(loss: DynamicsLoss) -> int | None:

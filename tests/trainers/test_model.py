@@ -176,3 +176,34 @@ def test_iterations_are_not_joined_to_one_block():
         trainer.advance()
     *_, blocks = split(trainer.data)
     assert blocks is None
+
+
+def finished(config, seed=0):
+    torch.manual_seed(0)  # of the networks' weights
+    trainer = ModelTrainer(SHORT, config, seed=seed)
+    while not trainer.done:
+        metrics = trainer.advance()
+    return trainer, metrics
+
+
+def test_the_last_fit_is_tried_from_other_first_weights():
+    once, before = finished(replace(MODEL, restarts=0))
+    again, after = finished(MODEL)
+    assert once.others() == []
+    assert after["model/held_out_error"] <= before["model/held_out_error"]
+    assert after["model/fit_steps"] == 3 * before["model/fit_steps"]
+    assert torch.equal(again.states(), once.states())  # no fit before the last is another
+    state, action = again.states()[:5], torch.zeros(5, 1)
+    assert len(again.others()) == 2
+    for other in again.others():
+        assert not torch.equal(other(state, action), again.dynamics(state, action))
+    resumed = ModelTrainer(SHORT, MODEL, seed=1)
+    resumed.load_state_dict(again.state_dict())
+    for mine, theirs in zip(resumed.others(), again.others(), strict=True):
+        assert torch.equal(mine(state, action), theirs(state, action))
+
+
+@pytest.mark.parametrize("change", [{"ensemble": 2}, {"kind": "prior"}, {"fit": ADAM.fit}])
+def test_what_has_no_single_residual_or_is_fitted_slowly_is_fitted_once(change):
+    trainer, _ = finished(replace(MODEL, **change))
+    assert trainer.others() == []
