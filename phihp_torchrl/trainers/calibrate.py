@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.planners import SearchConfig, score_sequences
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_contest import Contest
-from phihp_torchrl.trainers.calibrate_report import report, summary, write_table
-from phihp_torchrl.trainers.calibrate_rule import Choice, choose
+from phihp_torchrl.trainers.calibrate_report import report, summary, warn_of_doubt, write_table
+from phihp_torchrl.trainers.calibrate_rule import Choice, choose, in_doubt
 from phihp_torchrl.trainers.calibrate_ways import calmer, leaving
 from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.model import ModelTrainer
 from phihp_torchrl.trainers.phases import Phase, register_phase
 
 # An actor rests that has at most this chatter in the second halves of its episodes, where plans
@@ -38,11 +39,15 @@ class CalibratePhase:
     alone there; else there are the settings as given and calmer ones. More episodes are played
     while it is in doubt who is to act. No real step is taken.
 
+    Where other models that fit the data about as well say that the actor earns something else, the
+    settings stay as given, and a warning says so: what smoothness costs is not known then.
+
     Args:
         agent: the agent, with model, actor and planner; it is not compiled.
         config: settings of the phase.
         seed: seed of starts and noise.
         path: file for the table, JSON.
+        others: other models that fit the data about as well.
 
     Examples:
         >>> from phihp_torchrl import Agent, HybridDynamics, get_task
@@ -61,10 +66,19 @@ class CalibratePhase:
     """
 
     def __init__(
-        self, agent: Agent, config: CalibrateConfig, *, seed: int, path: Path | None = None
+        self,
+        agent: Agent,
+        config: CalibrateConfig,
+        *,
+        seed: int,
+        path: Path | None = None,
+        others: Sequence[nn.Module] = (),
     ) -> None:
         assert agent.planner_config is not None
         self.agent, self.config, self.seed, self.path = agent, config, seed, path
+        self.others = others
+        self.elsewhere: list[float] = []
+        """Mean returns of the actor in the other models, once they are known."""
         self.base: SearchConfig = agent.planner_config
         self.final: dict[str, Any] = {}
         generator = torch.Generator().manual_seed(seed)
@@ -125,16 +139,26 @@ class CalibratePhase:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs."""
-        return {"contest": self.contest.state_dict(), "final": dict(self.final)}
+        return {
+            "contest": self.contest.state_dict(),
+            "elsewhere": list(self.elsewhere),
+            "final": dict(self.final),
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a :meth:`state_dict`."""
         self.contest.load_state_dict(state["contest"])
+        self.elsewhere = list(state.get("elsewhere", ()))
         self.final = dict(state["final"])
 
     def _ways(self) -> dict[str, dict[str, Any]]:
         """The ways to plan, from what the actor's episodes show."""
-        played = self.contest.of_actor
+        played, own = self.contest.of_actor, self.contest.actor(self.config.max_episodes)
+        elsewhere = self.contest.actor_in(self.others)
+        self.elsewhere = [way.mean_return for way in elsewhere]
+        if in_doubt(own, elsewhere, confidence=self.config.confidence):
+            warn_of_doubt(own.mean_return, self.elsewhere)
+            return {"given": {}}
         reward = (played.total / played.lengths).abs().mean().item()
         promise = self._promise(self.contest.late_states(_PROMISES))
         alone = leaving(self.base, promise, reward)
@@ -174,7 +198,7 @@ class CalibratePhase:
         if rests or choice.name != first:  # this is smooth already, or the calmest that is taken
             contest.close()
         if contest.next_way is None and (choice.certain or not contest.double()):
-            self.final = summary(choice, ways, actor)
+            self.final = summary(choice, ways, actor) | {"actor_elsewhere": self.elsewhere}
             report(self.final)
             if self.path is not None:
                 write_table(self.path, self.final, self.planner_config)
@@ -188,7 +212,13 @@ def _build(context: Context) -> Phase:
         context.settings,
         seed=context.config.seed,
         path=context.directory.path / "calibration.json",
+        others=[other for phase in context.before.values() for other in _others(phase)],
     )
+
+
+def _others(phase: Phase) -> list[nn.Module]:
+    """The models that a phase has found beside the one that it gives to the agent."""
+    return [*phase.others()] if isinstance(phase, ModelTrainer) else []
 
 
 register_phase("calibrate", CalibrateConfig, _build, unit="episodes")

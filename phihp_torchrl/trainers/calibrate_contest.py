@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
@@ -116,6 +116,12 @@ class Contest:
         """What all that have played have earned."""
         return {name: self.way(name) for name in self._played}
 
+    def actor_in(self, others: Sequence[nn.Module]) -> list[Way]:
+        """What the actor earns from all starts in other models."""
+        models = (TaskWorldModel(self.agent.task, other) for other in others)
+        alone = self.agent.actor_alone()
+        return [_way(play(alone, model, self.starts)) for model in models]
+
     def late_states(self, count: int) -> Tensor:
         """States of the second halves of the actor's first episodes, ``[count * episodes, n]``."""
         episodes, played = self.config.episodes, self.of_actor
@@ -127,9 +133,7 @@ class Contest:
 
     def actor(self, episodes: int) -> Way:
         """What the actor earned in the first episodes."""
-        numbers = (self.of_actor.total, self.of_actor.chatter())
-        returns, chatter = (tuple(column[:episodes].tolist()) for column in numbers)
-        return Way(returns, chatter)
+        return _way(self.of_actor, episodes)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs; the actor's episodes are played again."""
@@ -157,3 +161,10 @@ class Contest:
 
     def _cost(self, episodes: int, steps: float) -> float:
         return steps * self.price.plan(episodes)
+
+
+def _way(played: Played, episodes: int | None = None) -> Way:
+    """What was earned in the first episodes, or in all of them."""
+    numbers = (played.total, played.chatter())
+    returns, chatter = (tuple(column[:episodes].tolist()) for column in numbers)
+    return Way(returns, chatter)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,17 @@ def summary(choice: Choice, ways: Mapping[str, Way], actor: Way) -> dict[str, An
         "actor_chatter": actor.mean_chatter,
         "ways": {name: _row(way, actor) for name, way in ways.items()},
     }
+
+
+def warn_of_doubt(own: float, elsewhere: Sequence[float]) -> None:
+    """Warn that models disagree, and say what to do."""
+    _log.warning(
+        "The actor earns %.4g in the model and %s in others that fit the real steps about as well. "
+        "So the planner's settings stay as given: what a calmer plan costs is not known. Take more "
+        "real steps (model.real_steps).",
+        own,
+        " and ".join(f"{each:.4g}" for each in elsewhere),
+    )
 
 
 def report(final: Mapping[str, Any]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,6 +13,8 @@ import torch
 _SHARE = 0.1
 # And of the actor's return, if that is more: it is less than anybody would notice.
 _TRIFLE = 3e-3
+# Returns in two models differ by more than this share of them: more than smoothness may cost.
+_ALIKE = 0.02
 # Chatter of the smoother plan, as a share of the other's; and the least difference of the two.
 _SMOOTHER, _NOTICEABLE = 2 / 3, 0.01
 
@@ -137,6 +139,27 @@ def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> C
     acts = plan.smoother_than(actor) if same else gain > 0.0 or close
     certain = same or abs(gain) > confidence * error
     return Choice(name, "planner" if acts else "actor", certain, gain, error)
+
+
+def in_doubt(own: Way, others: Sequence[Way], *, confidence: float = 2.0) -> bool:
+    """Whether models that fit the data about as well disagree about what the actor earns.
+
+    Then a plan that costs nothing in one of them may cost much in the world: whoever plans by a
+    model finds what it is wrong about.
+
+    Args:
+        own: what the actor earned in the model by which plans are made.
+        others: what it earned in each of the others, from the same starts.
+        confidence: standard errors of a difference that is no chance.
+
+    Examples:
+        >>> own, other = Way((10.0, 12.0), (0.0, 0.0)), Way((7.0, 8.0), (0.0, 0.0))
+        >>> in_doubt(own, [own]), in_doubt(own, [own, other])
+        (False, True)
+    """
+    gaps = (other.ahead_of(own) for other in others)
+    least = _ALIKE * abs(own.mean_return)
+    return any(abs(gap) > max(least, confidence * error) for gap, error in gaps)
 
 
 def _costs_at_most(allowed: float, way: Way, best: Way) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 
@@ -47,8 +48,8 @@ def make_agent(name="brief-pendulum", planner=SMALL):
     return Agent(task, dynamics=HybridDynamics.hybrid(task), actor=actor, planner_config=planner)
 
 
-def finished(agent, config=TINY, seed=0, path=None):
-    phase = CalibratePhase(agent, config, seed=seed, path=path)
+def finished(agent, config=TINY, seed=0, path=None, others=()):
+    phase = CalibratePhase(agent, config, seed=seed, path=path, others=others)
     while not phase.done:
         phase.advance()
     return phase
@@ -229,6 +230,31 @@ def test_an_actor_that_rests_is_left_alone():
     assert phase.final["actor_chatter"] <= 0.02
     assert next(iter(phase.final["ways"])) == "leaving"
     assert phase.planner_config.actor_margin > 0.0
+
+
+def test_where_models_disagree_the_settings_stay_as_given(caplog):
+    """The other model's pendulum is much lighter."""
+    agent = make_agent()
+    other = copy.deepcopy(agent.dynamics)
+    with torch.no_grad():
+        other.prior.log_constants.sub_(1.4)
+    phase = finished(agent, others=[other])
+    assert list(phase.final["ways"]) == ["given"]
+    assert phase.final["changes"] == {}
+    (elsewhere,) = phase.final["actor_elsewhere"]
+    assert elsewhere != pytest.approx(phase.final["actor_return"], rel=0.02)
+    assert "stay as given" in caplog.text
+    assert "model.real_steps" in caplog.text
+    going_on = CalibratePhase(agent, TINY, seed=0, others=[other])
+    going_on.load_state_dict(phase.state_dict())
+    assert going_on.elsewhere == [elsewhere]
+
+
+def test_models_that_agree_change_nothing(caplog):
+    agent = make_agent()
+    alone, among = finished(agent), finished(agent, others=[copy.deepcopy(agent.dynamics)])
+    assert among.final["ways"] == alone.final["ways"]
+    assert "stay as given" not in caplog.text
 
 
 def test_larger_networks_make_plans_dearer():

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from phihp_torchrl.trainers.calibrate_rule import Choice, Way, choose
+from phihp_torchrl.trainers.calibrate_rule import Choice, Way, choose, in_doubt
 
 
 def way(*returns: float, chatter: float = 0.4) -> Way:
@@ -152,3 +152,25 @@ def test_a_return_that_is_not_finite_is_never_chosen() -> None:
     assert pick(bad).acting == "actor"
     good = way(9.0, 11.0, 9.0, 11.0)
     assert pick(bad, good).name == "1"
+
+
+# Models that fit the data about as well.
+
+
+@pytest.mark.parametrize(
+    ("other", "doubt"),
+    [
+        (GIVEN, False),
+        (way(9.1, 11.1, 9.1, 11.1), False),  # by a hundredth
+        (way(8.0, 10.0, 8.0, 10.0), True),
+        (way(12.0, 12.0, 12.0, 12.0), True),
+        (way(12.0, 8.0, 12.0, 6.0), False),  # no more than chance
+        (way(9.0, 11.0, 9.0, math.nan), True),
+    ],
+)
+def test_models_disagree_by_more_than_a_trifle_and_more_than_chance(other: Way, doubt: bool):
+    assert in_doubt(GIVEN, [GIVEN, other]) is doubt
+
+
+def test_one_model_cannot_disagree() -> None:
+    assert in_doubt(GIVEN, []) is False
