@@ -40,7 +40,8 @@ class CalibratePhase:
     while it is in doubt who is to act. No real step is taken.
 
     Where other models that fit the data about as well say that the actor earns something else, the
-    settings stay as given, and a warning says so: what smoothness costs is not known then.
+    settings stay as given and the plan acts unless it is certain to earn less, and a warning says
+    so: what smoothness costs is not known then.
 
     Args:
         agent: the agent, with model, actor and planner; it is not compiled.
@@ -79,6 +80,8 @@ class CalibratePhase:
         self.others = others
         self.elsewhere: list[float] = []
         """Mean returns of the actor in the other models, once they are known."""
+        self.doubted = False
+        """Whether they say something else than the model by which plans are made."""
         self.base: SearchConfig = agent.planner_config
         self.final: dict[str, Any] = {}
         generator = torch.Generator().manual_seed(seed)
@@ -142,6 +145,7 @@ class CalibratePhase:
         return {
             "contest": self.contest.state_dict(),
             "elsewhere": list(self.elsewhere),
+            "doubted": self.doubted,
             "final": dict(self.final),
         }
 
@@ -149,6 +153,7 @@ class CalibratePhase:
         """Continue from a :meth:`state_dict`."""
         self.contest.load_state_dict(state["contest"])
         self.elsewhere = list(state.get("elsewhere", ()))
+        self.doubted = bool(state.get("doubted", False))
         self.final = dict(state["final"])
 
     def _ways(self) -> dict[str, dict[str, Any]]:
@@ -156,7 +161,8 @@ class CalibratePhase:
         played, own = self.contest.of_actor, self.contest.actor(self.config.max_episodes)
         elsewhere = self.contest.actor_in(self.others)
         self.elsewhere = [way.mean_return for way in elsewhere]
-        if in_doubt(own, elsewhere, confidence=self.config.confidence):
+        self.doubted = in_doubt(own, elsewhere, confidence=self.config.confidence)
+        if self.doubted:
             warn_of_doubt(own.mean_return, self.elsewhere)
             return {"given": {}}
         reward = (played.total / played.lengths).abs().mean().item()
@@ -192,13 +198,15 @@ class CalibratePhase:
         """Choose; where all have played, keep the choice or ask for as many episodes again."""
         contest, ways = self.contest, self.contest.all_ways()
         actor = contest.actor(contest.episodes)
-        choice = choose(ways, actor, confidence=self.config.confidence)
+        confidence = self.config.confidence
+        choice = choose(ways, actor, confidence=confidence, doubted=self.doubted)
         plan, first = ways[choice.name], next(iter(ways))
         rests = choice.certain and choice.gain >= 0.0 and plan.mean_chatter <= _RESTS
         if rests or choice.name != first:  # this is smooth already, or the calmest that is taken
             contest.close()
         if contest.next_way is None and (choice.certain or not contest.double()):
-            self.final = summary(choice, ways, actor) | {"actor_elsewhere": self.elsewhere}
+            models = {"models_disagree": self.doubted, "actor_elsewhere": self.elsewhere}
+            self.final = summary(choice, ways, actor) | models
             report(self.final)
             if self.path is not None:
                 write_table(self.path, self.final, self.planner_config)

@@ -84,7 +84,9 @@ class Choice(NamedTuple):
     gain_error: float
 
 
-def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> Choice:
+def choose(
+    ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0, doubted: bool = False
+) -> Choice:
     """Choose one way to plan, and then between that and the actor.
 
     The first way stays unless another
@@ -105,10 +107,15 @@ def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> C
     certain; all else is doubtful and deserves more episodes. Those are a second look at the same
     question, which a bound of two standard errors passes a little more often than one look would.
 
+    Where the model itself is doubted, the plan acts unless it is certain to earn less. It answers
+    at every step to where the world has gone; the actor has learned in that model alone, in which
+    it looks better than it is.
+
     Args:
         ways: what each way to plan earned, by name; the first is the one to be replaced.
         actor: what the actor alone earned.
         confidence: standard errors of a difference that is no chance.
+        doubted: whether models that fit the data as well disagree (:func:`in_doubt`).
 
     Examples:
         >>> given = Way((10.0, 12.0, 11.0), (0.4, 0.4, 0.4))
@@ -136,6 +143,8 @@ def choose(ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0) -> C
     gain, error = plan.ahead_of(actor)
     same = gain == error == 0.0
     close = not (behind[name] or actor.smoother_than(plan))
+    if doubted:
+        close = gain >= -confidence * error
     acts = plan.smoother_than(actor) if same else gain > 0.0 or close
     certain = same or abs(gain) > confidence * error
     return Choice(name, "planner" if acts else "actor", certain, gain, error)

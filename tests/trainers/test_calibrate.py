@@ -215,7 +215,7 @@ def test_a_plan_that_fails_late_does_not_act(monkeypatch):
 def test_the_first_calm_way_that_is_taken_is_the_last_that_plays(monkeypatch, taken):
     names = ["given", "calm", "mild", "loose"]
 
-    def choose(ways, actor, *, confidence):
+    def choose(ways, actor, **_):
         name = taken if taken in ways else "given"
         return Choice(name, "planner", True, 1.0, 0.1)
 
@@ -241,19 +241,21 @@ def test_where_models_disagree_the_settings_stay_as_given(caplog):
     phase = finished(agent, others=[other])
     assert list(phase.final["ways"]) == ["given"]
     assert phase.final["changes"] == {}
+    assert phase.final["models_disagree"] is True
     (elsewhere,) = phase.final["actor_elsewhere"]
     assert elsewhere != pytest.approx(phase.final["actor_return"], rel=0.02)
     assert "stay as given" in caplog.text
     assert "model.real_steps" in caplog.text
     going_on = CalibratePhase(agent, TINY, seed=0, others=[other])
     going_on.load_state_dict(phase.state_dict())
-    assert going_on.elsewhere == [elsewhere]
+    assert (going_on.elsewhere, going_on.doubted) == ([elsewhere], True)
 
 
 def test_models_that_agree_change_nothing(caplog):
     agent = make_agent()
     alone, among = finished(agent), finished(agent, others=[copy.deepcopy(agent.dynamics)])
     assert among.final["ways"] == alone.final["ways"]
+    assert among.final["models_disagree"] is False
     assert "stay as given" not in caplog.text
 
 

@@ -174,3 +174,12 @@ def test_models_disagree_by_more_than_a_trifle_and_more_than_chance(other: Way, 
 
 def test_one_model_cannot_disagree() -> None:
     assert in_doubt(GIVEN, []) is False
+
+
+@pytest.mark.parametrize(("loss", "acting"), [(1.0, "planner"), (4.0, "actor")])
+def test_where_the_model_is_doubted_a_plan_acts_unless_it_is_surely_behind(loss, acting) -> None:
+    """It is rough, and behind by one or four with an error of 1.08."""
+    actor = way(13.0, 11.0, 11.0, 9.0, chatter=0.0)
+    plan = way(*(each - loss for each in (11.0, 13.0, 11.0, 9.0)))
+    assert choose({"given": plan}, actor).acting == "actor"
+    assert choose({"given": plan}, actor, doubted=True).acting == acting
