@@ -71,8 +71,8 @@ class ModelConfig:
             last then keep the final λ, and take at most refit_steps.
         refit_steps: largest number of steps of such a fit; the first and the last fit take all.
         restarts: fits from other first weights of the residual after the last one, of which the
-            best by held-out error is kept; only where that one's error leaves something to gain,
-            and by least squares.
+            best by held-out error is kept; only by least squares, and where the held-out error is
+            over twice the error on the fitted transitions.
         fit: how the model is fitted.
         collect: how real data are collected.
 

@@ -30,6 +30,8 @@ _log = logging.getLogger(__name__)
 # Held-out error, a mean of squares in units of one-step changes, below which no fit is better in a
 # way that a plan would notice.
 _EXACT = 1e-8
+# Where it is at most so many times the error on the fitted transitions, these pin the model down.
+_PINNED = 2.0
 
 
 def chooses_solver(config: ModelConfig) -> bool:
@@ -70,7 +72,7 @@ def fit_again(
     config: ModelConfig,
     generator: torch.Generator,
 ) -> tuple[FitReport, list[dict[str, Tensor]]]:
-    """Fit from other first weights too, where the settings say so and there is something to gain.
+    """Fit from other first weights too, where the settings say so and the data leave much open.
 
     Args:
         loss: the loss of the fitted model.
@@ -87,7 +89,8 @@ def fit_again(
     residual = loss.dynamics.residual
     single = isinstance(residual, ResidualMLP) and not isinstance(residual, EnsembleResidual)
     quick = config.fit.method != "adam"
-    if not (config.restarts and single and quick) or report.held_out_error <= _EXACT:
+    known = max(_EXACT, _PINNED * report.train_error)
+    if not (config.restarts and single and quick) or report.held_out_error <= known:
         return report, []
     found, others = fit_from_other_weights(
         loss,

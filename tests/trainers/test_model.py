@@ -11,7 +11,7 @@ import torch
 from torchrl.envs import GymWrapper, StepCounter, TransformedEnv
 
 from phihp_torchrl.dynamics import FitConfig, split
-from phihp_torchrl.trainers import ModelTrainer, make_dynamics
+from phihp_torchrl.trainers import ModelTrainer, make_dynamics, model_fit
 from phihp_torchrl.worlds import SimulatedWorld
 
 from .trainer_parts import ADAM, MODEL, PENDULUM, SHORT, assert_same_state, plain
@@ -186,6 +186,13 @@ def finished(config, seed=0):
     return trainer, metrics
 
 
+@pytest.fixture
+def open_data(monkeypatch):
+    """No data are taken to pin the model down."""
+    monkeypatch.setattr(model_fit, "_PINNED", 0.0)
+
+
+@pytest.mark.usefixtures("open_data")
 def test_the_last_fit_is_tried_from_other_first_weights():
     once, before = finished(replace(MODEL, restarts=0))
     again, after = finished(MODEL)
@@ -203,7 +210,15 @@ def test_the_last_fit_is_tried_from_other_first_weights():
         assert torch.equal(mine(state, action), theirs(state, action))
 
 
+@pytest.mark.usefixtures("open_data")
 @pytest.mark.parametrize("change", [{"ensemble": 2}, {"kind": "prior"}, {"fit": ADAM.fit}])
 def test_what_has_no_single_residual_or_is_fitted_slowly_is_fitted_once(change):
     trainer, _ = finished(replace(MODEL, **change))
+    assert trainer.others() == []
+
+
+def test_what_the_data_pin_down_is_fitted_once():
+    """After two steps all errors are alike, on fitted transitions and on held-out ones."""
+    trainer, metrics = finished(MODEL)
+    assert 1e-8 < metrics["model/held_out_error"] < 2 * metrics["model/train_error"]
     assert trainer.others() == []
