@@ -24,8 +24,7 @@ from measures import DEFAULT_SAMPLES
 from phihp_torchrl import load_agent, load_config
 from phihp_torchrl.evaluation import TARGETS, markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
-from phihp_torchrl.trainers import ModelTrainer, read_run_config
-from phihp_torchrl.trainers.imagined_play import play
+from phihp_torchrl.trainers import ModelTrainer, play, read_run_config
 from phihp_torchrl.worlds import SimulatedWorld
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/restarts")

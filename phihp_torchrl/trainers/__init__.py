@@ -12,6 +12,7 @@ from phihp_torchrl.trainers.files import write_atomically
 from phihp_torchrl.trainers.finite import NonFiniteError
 from phihp_torchrl.trainers.floor import Floor
 from phihp_torchrl.trainers.imagined_analytic import ImaginedAnalytic
+from phihp_torchrl.trainers.imagined_play import play
 from phihp_torchrl.trainers.imagined_td3 import ImaginedTD3
 from phihp_torchrl.trainers.learners import (
     LEARNERS,
