@@ -97,8 +97,8 @@ def compile_graph(
 def compile_ahead(module: nn.Module, arguments: tuple[Tensor, ...], path: str | Path) -> None:
     """Compile a call of a module, with its weights, into a package of AOTInductor.
 
-    The compiler's headers are not precompiled for it. That would cost as much time as compiling the
-    package, and save a tenth of it from the next package on.
+    The compiler's headers are not precompiled for it: that takes long, and pays only on a machine
+    that makes many packages.
 
     Args:
         module: the module.

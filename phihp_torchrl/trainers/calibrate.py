@@ -19,7 +19,6 @@ from phihp_torchrl.trainers.calibrate_report import report, summary, warn_of_dou
 from phihp_torchrl.trainers.calibrate_rule import Choice, choose, in_doubt
 from phihp_torchrl.trainers.calibrate_ways import calmer, leaving
 from phihp_torchrl.trainers.context import Context
-from phihp_torchrl.trainers.model import ModelTrainer
 from phihp_torchrl.trainers.phases import Phase, register_phase
 
 # An actor rests that has at most this chatter in the second halves of its episodes, where plans
@@ -220,13 +219,8 @@ def _build(context: Context) -> Phase:
         context.settings,
         seed=context.config.seed,
         path=context.directory.path / "calibration.json",
-        others=[other for phase in context.before.values() for other in _others(phase)],
+        others=[o for phase in context.before.values() for o in getattr(phase, "others", list)()],
     )
-
-
-def _others(phase: Phase) -> list[nn.Module]:
-    """The models that a phase has found beside the one that it gives to the agent."""
-    return [*phase.others()] if isinstance(phase, ModelTrainer) else []
 
 
 register_phase("calibrate", CalibrateConfig, _build, unit="episodes")

@@ -14,7 +14,6 @@ from phihp_torchrl.dynamics import (
     BLOCK,
     SOLVERS,
     DynamicsLoss,
-    EnsembleResidual,
     FitConfig,
     FitReport,
     PhysicsPrior,
@@ -86,8 +85,7 @@ def fit_again(
     Returns:
         As :func:`~phihp_torchrl.dynamics.fit_from_other_weights`.
     """
-    residual = loss.dynamics.residual
-    single = isinstance(residual, ResidualMLP) and not isinstance(residual, EnsembleResidual)
+    single = type(loss.dynamics.residual) is ResidualMLP
     quick = config.fit.method != "adam"
     known = max(_EXACT, _PINNED * report.train_error)
     if not (config.restarts and single and quick) or report.held_out_error <= known:
@@ -104,8 +102,8 @@ def fit_again(
     )
     if found.held_out_error < report.held_out_error:
         _log.info(
-            "A fit from other first weights has a held-out error of %.2g, where the one that went "
-            "on from earlier fits had %.2g; it is kept.",
+            "A fit from other first weights is kept, with a held-out error of %.2g; the first fit "
+            "has %.2g.",
             found.held_out_error,
             report.held_out_error,
         )

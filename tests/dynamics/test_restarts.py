@@ -62,7 +62,7 @@ def test_a_fit_that_went_astray_is_left_behind(data):
 
 
 def test_a_good_fit_stays_as_it_is(data):
-    """It is compared with fits that had no steps."""
+    """It is compared with a fit that had one step."""
     loss, initial, once = fitted(data)
     before = parameters(loss.dynamics)
     none = FitConfig(method="adam", steps=1, batch_size=None)
