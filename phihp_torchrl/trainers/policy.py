@@ -147,6 +147,7 @@ class PolicyTrainer:
                 config.tail,
                 round_to=config.evaluation_interval,
                 floor=lambda: Floor(self.world_model, starts, steps, seed=seed),
+                extension=config.extension,
             )
 
     @property
@@ -166,12 +167,12 @@ class PolicyTrainer:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Critic updates so far and in all, which a plateau makes fewer."""
+        """Critic updates so far and in all, which a plateau makes fewer and a rise more."""
         return self.updates, self.schedule.end
 
     @property
     def done(self) -> bool:
-        """Whether the budget of updates or seconds is spent, or a plateau has ended learning."""
+        """Whether the updates are made, as many as they now are, or the seconds are spent."""
         limit = self.config.max_seconds
         return self.updates >= self.schedule.end or (limit is not None and self.seconds > limit)
 

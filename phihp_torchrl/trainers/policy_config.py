@@ -35,7 +35,7 @@ class PolicyConfig:
     Args:
         method: the way to learn, td3, analytic (gradients through the model, where that is smooth)
             or another registered one.
-        updates: total number of critic updates.
+        updates: planned number of critic updates; patience and extension may change it.
         batch_size: transitions in an update.
         num_worlds: number of imagined worlds that are stepped at once.
         chunk_steps: steps of all worlds between two rounds of updates.
@@ -50,6 +50,8 @@ class PolicyConfig:
         patience: share of the updates for which the imagined return may stand still before learning
             rates fall and learning ends; 0 for learning to the end.
         tail: share of the updates over which learning rates then fall.
+        extension: largest share of the updates that is added, before learning rates fall, while the
+            imagined return still rises fast; 0 for none. Nothing is added with patience 0.
         evaluation_interval: updates between two evaluations in the model, which choose the actor to
             keep.
         evaluation_episodes: imagined episodes in an evaluation.
@@ -95,6 +97,7 @@ class PolicyConfig:
     decay: float = 0.5
     patience: float = 0.4
     tail: float = 0.15
+    extension: float = 1.0
     evaluation_interval: int = 500
     evaluation_episodes: int = 64
     evaluation_steps: Steps | None = None
@@ -131,7 +134,7 @@ class PolicyConfig:
             check_choice(self, "strategies", ("auto", "none"))
         check_share(self, "random_fraction", "decay", "patience", "tail")
         check_count(self, "random_steps", "real_evaluation_episodes", least=0)
-        check_not_negative(self, "exploration_noise")
+        check_not_negative(self, "exploration_noise", "extension")
         if self.random_steps > self.replay_capacity:
             raise ConfigError(
                 "random_steps",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import logging
 from dataclasses import replace
 
@@ -27,9 +28,9 @@ class Known:
         return self.at_floor
 
 
-def plateau(at_floor=0.0):
-    schedule = Schedule(UPDATES, decay=0.0)
-    return Plateau(schedule, 0.2, 0.15, round_to=100, floor=lambda: Known(at_floor))
+def plateau(at_floor=0.0, decay=0.0, extension=0.0):
+    schedule, floor = Schedule(UPDATES, decay), Known(at_floor)
+    return Plateau(schedule, 0.2, 0.15, round_to=100, floor=lambda: floor, extension=extension)
 
 
 def end_of(watch, returns):
@@ -75,6 +76,61 @@ def test_a_rise_is_paired_and_of_a_size(change, is_rise):
     assert (watch.risen == 200) is is_rise
 
 
+RISING = [FLAT + 10.0 * k for k in range(1, 40)]
+
+
+@pytest.mark.parametrize(
+    ("extension", "later"), [(0.0, 0), (0.09, 0), (0.1, 100), (0.35, 300), (1.0, 1000)]
+)
+def test_rates_wait_for_returns_that_rise_fast(caplog, extension, later):
+    caplog.set_level(logging.INFO)
+    watch = plateau(decay=0.5, extension=extension)
+    assert end_of(watch, RISING) == UPDATES + later
+    assert watch.schedule.falls == UPDATES / 2 + later
+    assert caplog.text.count("still rise fast at update 500") == (later > 0)
+
+
+@pytest.mark.parametrize(
+    ("steps", "later"),
+    [
+        ([1.0] * 4 + [0.1] * 9, 0),  # a fortieth of what is gained, when it is asked
+        ([1.0] * 6 + [0.1] * 9, 200),
+        ([1.0] * 4 + [0.0] + [1.0] * 9, 0),  # when it is asked, they stand
+    ],
+    ids=str,
+)
+def test_rates_fall_once_returns_rise_slowly(steps, later):
+    watch = plateau(decay=0.5, extension=1.0)
+    watch.patience = UPDATES
+    assert end_of(watch, list(FLAT + torch.tensor(steps).cumsum(0)[:, None])) == UPDATES + later
+
+
+def test_what_is_put_off_may_still_land_early():
+    watch = plateau(decay=0.5, extension=1.0)
+    end = end_of(watch, [*RISING[:7], *[RISING[6]] * 9])
+    assert watch.schedule.later == 300  # at updates 500 to 700
+    assert end == watch.schedule.landing + 200 < UPDATES + 300
+    scales = [watch.schedule.scale(k) for k in (600, 800, 900, end)]
+    assert scales == pytest.approx([1.0, 1.0, 0.8, 0.05], abs=0.21)
+    assert scales == sorted(scales, reverse=True)
+
+
+def test_what_is_put_off_is_kept_by_a_checkpoint():
+    whole = plateau(decay=0.5, extension=1.0)
+    end_of(whole, RISING[:6])
+    resumed = plateau(decay=0.5, extension=1.0)
+    resumed.load_state_dict(copy.deepcopy(whole.state_dict()))
+    for watch in (whole, resumed):
+        for k, each in enumerate(RISING[6:9], 7):
+            watch.see(100 * k, each)
+    assert whole.schedule.later == resumed.schedule.later == 500
+    assert whole.schedule.state_dict() == resumed.schedule.state_dict()
+    old = {key: value for key, value in whole.state_dict().items() if key != "lately"}
+    del old["schedule"]["later"]
+    resumed.load_state_dict(old)
+    assert resumed.schedule.later == 0
+
+
 def test_at_the_floor_nothing_is_a_plateau():
     assert end_of(plateau(at_floor=0.5), [FLAT + 2.0] * 9) == UPDATES
 
@@ -107,6 +163,16 @@ def test_learning_stops_at_a_plateau_and_keeps_the_best():
         ends.append(trainer.advance()["policy/end"])
     assert ends == [40.0, 12.0, 12.0]
     assert trainer.progress == (12, 12)
+
+
+@pytest.mark.parametrize("extension", [0.0, 0.5])
+def test_learning_goes_on_while_returns_rise(extension):
+    trainer = policy_trainer(replace(POLICY, updates=40, patience=0.5, extension=extension))
+    rising = itertools.count()
+    trainer.evaluation.imagined = lambda actor: FLAT + next(rising)
+    while not trainer.done:
+        end = trainer.advance()["policy/end"]
+    assert trainer.updates == end == 40 + 40 * extension
 
 
 @pytest.mark.parametrize("done_before", [1, 3])
