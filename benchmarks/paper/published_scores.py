@@ -21,7 +21,14 @@ from pathlib import Path
 OUT = Path("results/worlds/published.csv")
 REPOSITORY = "github.com/nicklashansen/tdmpc2"
 METHODS = {"tdmpc2": "TD-MPC2", "dreamerv3": "DreamerV3", "sac": "SAC"}
-TASKS = ("pendulum-swingup", "cartpole-swingup", "acrobot-swingup")
+TASKS = (
+    "pendulum-swingup",
+    "cartpole-swingup",
+    "cartpole-swingup-sparse",
+    "cartpole-balance",
+    "cartpole-balance-sparse",
+    "acrobot-swingup",
+)
 STEPS = (100_000, 200_000, 500_000, 1_000_000)
 COLUMNS = ("task", "method", "environment_steps", "mean", "lowest", "highest", "seeds", "source")
 

@@ -51,6 +51,9 @@ class Entry:
 ENTRIES = {
     "pendulum-swingup": Entry("dm_control pendulum", 2000, 800.0),
     "cartpole-swingup": Entry("dm_control cartpole", 4000, 850.0),
+    "cartpole-swingup-sparse": Entry("dm_control cartpole swingup sparse", 4000, 700.0),
+    "cartpole-balance": Entry("dm_control cartpole balance", 2000, 950.0),
+    "cartpole-balance-sparse": Entry("dm_control cartpole balance sparse", 2000, 950.0),
     "mountain-car": Entry("gymnasium MountainCarContinuous-v0", 4000, 90.0),
     "mountain-car-as-it-is": Entry("gymnasium MountainCarContinuous-v0 as it is", 4000, 90.0),
     "pendulum-v1": Entry("gymnasium Pendulum-v1", 2000, -200.0),

@@ -57,12 +57,18 @@ class Arranged(Transform):
 
 
 def dm_control_env(
-    domain: str, arrange: Arrange, *, size: int, unit: float = 1.0, action_repeat: int = 2
+    domain: str,
+    arrange: Arrange,
+    *,
+    size: int,
+    unit: float = 1.0,
+    action_repeat: int = 2,
+    task: str = "swingup",
 ) -> EnvBase:
-    """dm_control's swing-up of ``domain``, without pictures, each action held for some steps."""
+    """dm_control's ``task`` in ``domain``, without pictures, each action held for some steps."""
     os.environ.setdefault("MUJOCO_GL", "disabled")
     from torchrl.envs import DMControlEnv
 
-    env = DMControlEnv(domain, "swingup", frame_skip=action_repeat)
+    env = DMControlEnv(domain, task, frame_skip=action_repeat)
     entries = tuple(key for key in env.observation_spec if key != "pixels")
     return TransformedEnv(env, Arranged(entries, arrange, size, unit))

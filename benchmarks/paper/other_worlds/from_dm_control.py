@@ -5,6 +5,7 @@ Friction is left out of the equations, as a user does not know it.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import pi
 
 import torch
@@ -56,11 +57,13 @@ class RailCartPole(CartPole):
         return rate + held.unsqueeze(-1) * self.impulse("x", state, constants)
 
 
-def cartpole_env() -> EnvBase:
+def cartpole_env(task: str = "swingup") -> EnvBase:
     """dm_control shows x, cos, sin, x_dot, theta_dot; its motor gives 10 N."""
-    return dm_control_env(
-        "cartpole", lambda x, cos, sin, v, omega: [x, v, cos, sin, omega], size=5, unit=10.0
-    )
+
+    def arrange(x, cos, sin, v, omega):  # type: ignore[no-untyped-def]
+        return [x, v, cos, sin, omega]
+
+    return dm_control_env("cartpole", arrange, size=5, unit=10.0, task=task)
 
 
 def pendulum_env() -> EnvBase:
@@ -86,6 +89,17 @@ def cartpole_reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor
     centered = (1.0 + 0.1 ** (x / 2.0).square()) / 2.0
     slow = (1.0 + 0.1 ** (theta_dot / 5.0).square()) / 2.0
     return 2.0 * upright * effort * centered * slow
+
+
+def cartpole_sparse_reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+    """dm_control's, summed over two steps: within 5.7 degrees of upright, 0.25 m of the middle."""
+    x, _, theta, _ = next_state.unbind(-1)
+    return 2.0 * ((theta.cos() >= 0.995) & (x.abs() <= 0.25)).to(state.dtype)
+
+
+def pole_height(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
+    """Height of the pole, to collect by."""
+    return next_state[..., 2].cos()
 
 
 def pendulum_reward(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
@@ -115,6 +129,20 @@ CARTPOLE = Task(
     reset=Box.around((0.0, 0.0, pi, 0.0), (0.03, 0.03, 0.03, 0.03)),
     coverage=Box.around((0.0, 0.0, 0.0, 0.0), (1.8, 4.0, pi, 10.0)),
     reward=cartpole_reward,
+)
+BALANCE = replace(
+    CARTPOLE,
+    name="dm-cartpole-balance",
+    reset=Box.around((0.0, 0.0, 0.0, 0.0), (0.1, 0.03, 0.034, 0.03)),
+)
+SPARSE, BALANCE_SPARSE = (
+    replace(
+        task,
+        name=f"{task.name}-sparse",
+        reward=cartpole_sparse_reward,
+        exploration_reward=pole_height,
+    )
+    for task in (CARTPOLE, BALANCE)
 )
 PENDULUM = Task(
     name="dm-pendulum",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from other_worlds import from_dm_control, from_gymnasium
@@ -71,6 +72,20 @@ WORLDS = {
             "hard stops": Fit(replace(_TEXTBOOK, position_limits=_RAIL), _RK4),
         },
     ),
+    **{
+        f"dm_control cartpole {name}": OtherWorld(
+            task,
+            partial(from_dm_control.cartpole_env, name.replace(" ", "_")),
+            repeat=2,
+            model=_RK4,
+            stops=_RAIL,
+        )
+        for name, task in (
+            ("balance", from_dm_control.BALANCE),
+            ("balance sparse", from_dm_control.BALANCE_SPARSE),
+            ("swingup sparse", from_dm_control.SPARSE),
+        )
+    },
     "dm_control pendulum": OtherWorld(
         from_dm_control.PENDULUM,
         from_dm_control.pendulum_env,
