@@ -4,7 +4,9 @@
 
 Writes ``phihp_torchrl/trainers/compiling.json``: for a round of updates of TD3 and a chunk of
 imagined steps, the seconds of CPU that compiling takes with an empty cache, and the milliseconds
-that a call then takes less. Eager and compiled code take turns, by the task's default preset.
+that a call then takes less. Eager and compiled code take turns, by the task's default preset. For a
+step of a model alone, with Runge-Kutta and two substeps, there are its operations, the seconds that
+compiling takes, and the milliseconds of a call for as many rows as a plan has, both ways.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from statistics import median
 from typing import Any
 
 TASK, ROUNDS = "pendulum-swingup", 30
+STEP_TASK, STEP_ROWS = "cartpole-swingup", 192
 FILE = Path(__file__).parents[2] / "phihp_torchrl" / "trainers" / "compiling.json"
 
 
@@ -66,7 +69,42 @@ def measure() -> dict[str, Any]:
                     of.append(1e3 * (time.thread_time() - start))
         saved[name] = round(median(times[0]) - median(times[1]), 3)
         print(name, seconds[name], *(f"{median(of):.3f}" for of in times), flush=True)
-    return {"seconds": seconds, "milliseconds": saved, "chunk_steps": policy.chunk_steps}
+    return {
+        "seconds": seconds,
+        "milliseconds": saved,
+        "chunk_steps": policy.chunk_steps,
+        "step": step_of_a_model(),
+    }
+
+
+def step_of_a_model() -> dict[str, Any]:
+    """What a compiled step of a dear model costs and saves."""
+    import torch
+
+    from phihp_torchrl import HybridDynamics, get_task
+    from phihp_torchrl.dynamics import PreparedModel
+    from phihp_torchrl.integrators import RK4
+
+    task = get_task(STEP_TASK)
+    dynamics = HybridDynamics.hybrid(task, integrator=RK4(substeps=2))
+    state, action = task.coverage.sample([STEP_ROWS]), torch.zeros(STEP_ROWS, task.action_dim)
+    eager = PreparedModel(task, dynamics, state)
+    dynamics.compile_step()
+    with torch.no_grad():
+        start = cpu()
+        dynamics.compiled_step(state, action)
+        seconds = cpu() - start
+        fast = PreparedModel(task, dynamics, state)
+        times: tuple[list[float], list[float]] = ([], [])
+        for _ in range(10 * ROUNDS):
+            for model, of in zip((eager, fast), times, strict=True):
+                start = time.thread_time()
+                model.advance(state, action)
+                of.append(1e3 * (time.thread_time() - start))
+    found = {"operations": eager.operations, "seconds": round(seconds, 1)}
+    found |= {"eager": round(median(times[0]), 3), "compiled": round(median(times[1]), 3)}
+    print("step", found, flush=True)
+    return found
 
 
 def functions(trainer: Any) -> dict[str, Callable[[], Any]]:

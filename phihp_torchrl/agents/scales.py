@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.agents.equations import Layers
-from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.dynamics import PreparedModel, TaskWorldModel
 from phihp_torchrl.imagination import StartConfig, StartStates, finite_transition, make_start_states
 from phihp_torchrl.tasks import Task, Transition
 
@@ -82,7 +82,25 @@ class Scales:
         return [torch.cat([read, weight[..., len(scale) :]], -1), bias - shift, *others]
 
 
-class ScaledModel(TaskWorldModel):
+class _InUnits:
+    """What units change of a model, prepared or not, that is the next class."""
+
+    center: Tensor
+    scale: Tensor
+    reward_scale: Tensor
+
+    def locate(self, observation: Tensor) -> Tensor:
+        return super().locate(observation * self.scale + self.center)  # type: ignore[misc]
+
+    def observe(self, state: Tensor) -> Tensor:
+        return (super().observe(state) - self.center) / self.scale  # type: ignore[misc]
+
+    def transition(self, state: Tensor, action: Tensor) -> Transition:
+        step = super().transition(state, action)  # type: ignore[misc]
+        return step._replace(reward=step.reward / self.reward_scale)
+
+
+class ScaledModel(_InUnits, TaskWorldModel):
     """A model that gives, as functions of tensors, observations and rewards in the networks' units.
 
     Everything that trains networks reads the model through :meth:`observe` and :meth:`transition`.
@@ -101,25 +119,23 @@ class ScaledModel(TaskWorldModel):
         tensor([0.5000, 0.0000, 0.0000])
     """
 
-    center: Tensor
-    scale: Tensor
-    reward_scale: Tensor
-
     def __init__(self, model: TaskWorldModel, scales: Scales) -> None:
         super().__init__(model.task, model.transitions)
         self.register_buffer("center", scales.center)
         self.register_buffer("scale", scales.scale)
         self.register_buffer("reward_scale", torch.tensor(scales.reward))
 
-    def locate(self, observation: Tensor) -> Tensor:
-        return super().locate(observation * self.scale + self.center)
+    def prepared(self) -> PreparedModel | TaskWorldModel:
+        return _PreparedScaled(self) if self.steps_as(ScaledModel) else self
 
-    def observe(self, state: Tensor) -> Tensor:
-        return (super().observe(state) - self.center) / self.scale
 
-    def transition(self, state: Tensor, action: Tensor) -> Transition:
-        step = super().transition(state, action)
-        return step._replace(reward=step.reward / self.reward_scale)
+class _PreparedScaled(_InUnits, PreparedModel):
+    """The same for one rollout."""
+
+    def __init__(self, model: ScaledModel) -> None:
+        super().__init__(model.task, model.transitions, model.like)
+        self.center, self.scale = model.center, model.scale
+        self.reward_scale = model.reward_scale
 
 
 def scaled(model: TaskWorldModel, scales: Scales) -> TaskWorldModel:

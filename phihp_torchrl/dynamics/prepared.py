@@ -1,4 +1,4 @@
-"""A world model for one plan: what does not change from step to step is computed once."""
+"""A world model for one plan or rollout: what no step changes is computed once."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from phihp_torchrl.dynamics.compiled_step import count_operations
 from phihp_torchrl.dynamics.hybrid import HybridDynamics
 from phihp_torchrl.dynamics.prior import PhysicsPrior
 from phihp_torchrl.dynamics.residual import ResidualMLP
@@ -19,10 +20,10 @@ Derivative = Callable[[Tensor, Tensor], Tensor]
 class PreparedModel:
     """The functions of a :class:`TaskWorldModel` in fewer and larger operations, up to rounding.
 
-    It is made anew for each plan, because it reads the weights as they are then. States are
-    matrices ``[rows, n]``, and nothing is differentiated. Beside the functions of a world model it
-    has a step in two halves: :meth:`advance` moves the state, and :meth:`judge` gives rewards and
-    ends of many steps at once.
+    It is made anew for each plan or rollout, because it reads the weights as they are then. States
+    are matrices ``[rows, n]``, and nothing is differentiated. Beside the functions of a world model
+    it has a step in two halves: :meth:`advance` moves the state, and :meth:`judge` gives rewards
+    and ends of many steps at once.
 
     Without gradients and graphs, the time of a plan of some hundred rows is that of calling
     operations, not of their arithmetic. So the constants of the equations are computed once, and
@@ -49,6 +50,12 @@ class PreparedModel:
         self.task = task
         self._step = self._make_step(dynamics, like)
         self._low, self._high = like.new_tensor(task.action_low), like.new_tensor(task.action_high)
+
+    @property
+    def operations(self) -> int:
+        """Number of tensor operations of a step of the dynamics."""
+        sizes = self.task.system.state_dim, self.task.system.acting_dim
+        return count_operations(self._step, *(self._low.new_zeros(2, size) for size in sizes))
 
     def locate(self, observation: Tensor) -> Tensor:
         """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""
@@ -97,6 +104,8 @@ class PreparedModel:
             return dynamics
         if type(dynamics).step is not HybridDynamics.step:
             return dynamics.step
+        if dynamics.compiled_step is not None:
+            return dynamics.compiled_step
         derivative = self._make_derivative(dynamics)
         solve = dynamics.integrator.prepared(self.task.time_step, dynamics.layout, like)
         return lambda state, action: solve(lambda s: derivative(s, action), state)

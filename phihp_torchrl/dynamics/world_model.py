@@ -79,22 +79,30 @@ class TaskWorldModel(WorldModel):
         return integrator is None or integrator.compiles
 
     def prepared(self) -> PreparedModel | TaskWorldModel:
-        """The same functions for one eager plan, which does not follow later changes of weights.
+        """The same functions for one eager plan or rollout, which later changes of weights miss.
 
         It is this model itself where a subclass, of the model or of the task, steps differently.
         """
+        if not self.steps_as(TaskWorldModel):
+            return self
+        return PreparedModel(self.task, self.transitions, self.like)
+
+    def steps_as(self, kind: type[TaskWorldModel]) -> bool:
+        """Whether no subclass, of ``kind`` or of the task, has other functions of tensors."""
         ours: dict[tuple[type, type], tuple[str, ...]] = {
-            (type(self), TaskWorldModel): ("locate", "observe", "transition"),
+            (type(self), kind): ("locate", "observe", "transition"),
             (type(self.task), Task): ("transition", "is_terminated"),
         }
-        if any(
-            getattr(kind, name) is not getattr(base, name)
-            for (kind, base), names in ours.items()
+        return all(
+            getattr(sub, name) is getattr(base, name)
+            for (sub, base), names in ours.items()
             for name in names
-        ):
-            return self
-        like = next(self.transitions.parameters(), torch.empty(0))
-        return PreparedModel(self.task, self.transitions, like.detach())
+        )
+
+    @property
+    def like(self) -> Tensor:
+        """A tensor of the dtype and on the device of the dynamics."""
+        return next(self.transitions.parameters(), torch.empty(0)).detach()
 
     def locate(self, observation: Tensor) -> Tensor:
         """Observation ``[*batch, o]`` -> state ``[*batch, n]``."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.compilation import compile_graph
-from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.dynamics import PreparedModel, TaskWorldModel
 from phihp_torchrl.imagination.transitions import Batch, finite_transition
 from phihp_torchrl.tasks import ActionBounds
 
@@ -89,7 +89,7 @@ def draw_noise(
 
 
 def step_worlds(
-    world_model: TaskWorldModel,
+    world_model: TaskWorldModel | PreparedModel,
     policy: Policy,
     weights: Sequence[Tensor],
     worlds: Worlds,
@@ -153,7 +153,7 @@ class Returns(NamedTuple):
 
 
 def sum_rewards(
-    world_model: TaskWorldModel,
+    world_model: TaskWorldModel | PreparedModel,
     policy: Policy,
     weights: Sequence[Tensor],
     returns: Returns,
@@ -221,19 +221,20 @@ class Rollouts:
             _logger.warning("Rollouts are not compiled: the model's integrator does not compile.")
             compile = False
         self.task = world_model.task
+        self.world_model, self.policy = world_model, policy
         self.bounds = self.task.bounds.to(device)
         self.max_age = max_age
-        self._step_worlds = compile_graph(
-            partial(step_worlds, world_model, policy), enabled=compile
-        )
-        self._sum_rewards = partial(sum_rewards, world_model, policy)
-        self._sum_rewards_chunk = compile_graph(self._sum_rewards, enabled=compile)
+        self._compiled: tuple[Callable[..., Any], Callable[..., Any]] | None = None
+        if compile:
+            step, sum_up = (partial(f, world_model, policy) for f in (step_worlds, sum_rewards))
+            self._compiled = compile_graph(step), compile_graph(sum_up)
 
     def chunk(
         self, weights: Sequence[Tensor], worlds: Worlds, noise: ChunkNoise
     ) -> tuple[Batch, Worlds]:
         """Step all worlds through a chunk: :func:`step_worlds`."""
-        return self._step_worlds(weights, worlds, noise, self.bounds, self.max_age)
+        step, _ = self._compiled or self._eager()
+        return step(weights, worlds, noise, self.bounds, self.max_age)
 
     def returns(
         self,
@@ -253,10 +254,18 @@ class Rollouts:
             signals: references and inputs after each step, registers ``[steps, N, size]``. By
                 default they go on as the model expects.
         """
+        _, eager = self._eager()
+        _, piece = self._compiled or (None, eager)
         returns, size = Returns.from_state(state), self._RETURN_STEPS
         whole = steps - steps % size
         for first in range(0, whole, size):
             after = None if signals is None else signals[first : first + size]
-            returns = self._sum_rewards_chunk(weights, returns, self.bounds, size, gamma, after)
+            returns = piece(weights, returns, self.bounds, size, gamma, after)
         after = None if signals is None else signals[whole:]
-        return self._sum_rewards(weights, returns, self.bounds, steps % size, gamma, after)
+        return eager(weights, returns, self.bounds, steps % size, gamma, after)
+
+    def _eager(self) -> tuple[Callable[..., Any], Callable[..., Any]]:
+        """Both functions with the weights that the model has now, in as few operations."""
+        model = self.world_model if torch.is_grad_enabled() else self.world_model.prepared()
+        step, sum_up = (partial(f, model, self.policy) for f in (step_worlds, sum_rewards))
+        return step, sum_up

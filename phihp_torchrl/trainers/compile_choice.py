@@ -7,11 +7,12 @@ follows from settings and measured rates alone, whether the compiler's cache is 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from phihp_torchrl.config import resolve_seconds
 from phihp_torchrl.display import duration
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.worlds import World
@@ -24,6 +25,11 @@ _STEP, _STEP_SECONDS = (of["chunk"] / _RATES["chunk_steps"] for of in (_SAVED, _
 # A round of updates in the file has the gradients of two updates of critics and of one of an actor.
 _GRADIENT, _GRADIENT_SECONDS = (of["update"] / 3 for of in (_SAVED, _SECONDS))
 _RETURN_SECONDS = 5 * _STEP_SECONDS  # the steps of a compiled piece of a return
+# A step of a model alone, for as many rows as a plan has: what it takes does not grow with its
+# operations as what it saves does, for a call of a graph has its own price.
+_ALONE = _RATES["step"]
+# Ways to plan that calibration lets play.
+_WAYS = 2
 # Learning that may end at a plateau is taken to have this share of its updates.
 _PLATEAU = 0.9
 
@@ -86,6 +92,35 @@ def earned(config: RunConfig, name: str, settings: Any, world: World) -> Earned:
     return of(config, settings, world) if of else Earned(0.0, 0.0)
 
 
+def earned_by_step(
+    config: RunConfig, phases: Sequence[str], world: World, operations: int
+) -> Earned:
+    """What a compiled step of the model would save in phases that earn no graphs of their own.
+
+    Args:
+        config: settings of the run.
+        phases: names of the phases that are to come.
+        world: the world.
+        operations: tensor operations of a step.
+
+    Examples:
+        >>> from phihp_torchrl import load_config, make_world
+        >>> from phihp_torchrl.trainers import read_run_config
+        >>> world, config = make_world("pendulum"), read_run_config(load_config("pendulum"))
+        >>> phases = ("policy", "calibrate", "evaluate")
+        >>> [earned_by_step(config, phases, world, count).pays for count in (50, 1000)]
+        [False, True]
+    """
+    calls = 0.0
+    for name in phases:
+        settings = resolve_seconds(config.section(name), world.task.time_step)
+        if name in _STEPS and not earned(config, name, settings, world).pays:
+            calls += _STEPS[name](config, settings, world)
+    each = operations / _ALONE["operations"]
+    saved = max(0.0, each * _ALONE["eager"] - _ALONE["compiled"])
+    return Earned(calls * saved / 1e3, each * _ALONE["seconds"] if calls else 0.0)
+
+
 def _policy(config: RunConfig, settings: Any, world: World) -> Earned:
     td3, refit, steps = settings.td3, settings.refit, world.task.max_steps
     updates = settings.updates * (_PLATEAU if settings.patience else 1.0)
@@ -111,6 +146,33 @@ def _policy(config: RunConfig, settings: Any, world: World) -> Earned:
     return Earned(saved / 1e3, taken)
 
 
+def _policy_steps(config: RunConfig, settings: Any, world: World) -> float:
+    """Calls of the model in imagination; gradients through it are not among them."""
+    updates, refit = settings.updates, settings.refit
+    played = settings.evaluation_steps or world.task.max_steps
+    calls = (1 + updates / settings.evaluation_interval) * played
+    if settings.method == "td3":
+        calls += updates / settings.updates_per_step
+    if refit.interval:
+        calls += (1 + max(0.0, updates - refit.start) / refit.interval) * refit.horizon
+    return calls
+
+
+def _calibrate_steps(config: RunConfig, settings: Any, world: World) -> float:
+    return _WAYS * world.task.max_steps * _plan_steps(config)
+
+
+def _evaluate_steps(config: RunConfig, settings: Any, world: World) -> float:
+    """Calls of the model by plans: of all episodes at once, or of one after the other."""
+    alone = 1 if world.truth is not None else settings.episodes * world.has_env
+    return (alone * world.task.max_steps + settings.latency_actions) * _plan_steps(config)
+
+
+def _plan_steps(config: RunConfig) -> int:
+    planner = config.planner
+    return 0 if planner is None else planner.planning_horizon * planner.optim_steps
+
+
 def _td3(config: RunConfig, settings: Any, world: World) -> Earned:
     played = settings.evaluation_episodes > 0
     saved = settings.real_steps * (
@@ -133,7 +195,7 @@ def _evaluate(config: RunConfig, settings: Any, world: World) -> Earned:
     if config.planner is None or world.truth is not None or not world.has_env:
         return Earned(0.0, 0.0)
     plans = settings.episodes * world.task.max_steps + settings.latency_actions
-    steps = config.planner.planning_horizon * config.planner.optim_steps
+    steps = _plan_steps(config)
     return Earned(plans * steps * _STEP / 1e3, steps * _STEP_SECONDS)
 
 
@@ -142,4 +204,9 @@ _PHASES: dict[str, Callable[[RunConfig, Any, World], Earned]] = {
     "td3": _td3,
     "tdmpc": _tdmpc,
     "evaluate": _evaluate,
+}
+_STEPS: dict[str, Callable[[RunConfig, Any, World], float]] = {
+    "policy": _policy_steps,
+    "calibrate": _calibrate_steps,
+    "evaluate": _evaluate_steps,
 }

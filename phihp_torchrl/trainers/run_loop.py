@@ -17,9 +17,10 @@ from torchrl.checkpoint import CheckpointError, GlobalRNGState
 
 from phihp_torchrl.config import resolve_seconds
 from phihp_torchrl.display import Progress
+from phihp_torchrl.dynamics import HybridDynamics, PreparedModel
 from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.trainers.checkpoints import clear_rotation, load_latest, load_state
-from phihp_torchrl.trainers.compile_choice import earned
+from phihp_torchrl.trainers.compile_choice import earned, earned_by_step
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.finite import check_finite
 from phihp_torchrl.trainers.headline import headline
@@ -125,6 +126,8 @@ class RunLoop:
             known = getattr(phase, "world", None)
             world = known if isinstance(known, World) else world
         settings = resolve_seconds(self.config.section(name), world.task.time_step)
+        compiled = self._compiles(name, settings, world)
+        self._compile_step(name, world)
         context = Context(
             config=self.config,
             settings=settings,
@@ -132,7 +135,7 @@ class RunLoop:
             world=world,
             before=dict(self.phases),
             directory=self.directory,
-            compile=self._compiles(name, settings, world),
+            compile=compiled,
         )
         return PHASES[name].build(context)
 
@@ -147,6 +150,23 @@ class RunLoop:
             if found.taken and name in self.config.phases_to_do:
                 self.progress.say(found.words(name))
         return bool(chosen[name])
+
+    def _compile_step(self, name: str, world: World) -> None:
+        """Compile the step of the model alone where phases that are not compiled earn it."""
+        dynamics = getattr(self.phases.get("model"), "dynamics", None)
+        if self.config.compile != "auto" or not isinstance(dynamics, HybridDynamics):
+            return
+        chosen = self.record.metadata["compiled"]
+        if "step" not in chosen:
+            to_do = self.config.phases_to_do
+            left = to_do[to_do.index(name) :] if name in to_do else to_do
+            operations = PreparedModel(world.task, dynamics, torch.empty(0)).operations
+            found = earned_by_step(self.config, left, world, operations)
+            chosen["step"] = found.pays
+            if found.pays:
+                self.progress.say(found.words("a step of the model"))
+        if chosen["step"]:
+            dynamics.compile_step()
 
     def _advance(self, name: str, phase: Phase, table: MetricsTable, logger: RunLogger) -> bool:
         """Work through a phase; false if a signal ended it early."""

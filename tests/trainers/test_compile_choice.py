@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import torch
 
-from phihp_torchrl import load_config, make_world
+from phihp_torchrl import HybridDynamics, load_config, make_world
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.trainers import compile_choice, read_run_config, run
-from phihp_torchrl.trainers.compile_choice import Earned, earned
+from phihp_torchrl.trainers.compile_choice import Earned, earned, earned_by_step
 
 from .run_parts import CONFIG
 
@@ -62,6 +62,49 @@ def test_episodes_of_a_batch_are_no_reason_to_compile_plans():
     assert not found("evaluate", world=alone, episodes=1, latency_actions=0).pays
 
 
+PHASES = ("policy", "calibrate", "evaluate")
+
+
+def by_step(operations, phases=PHASES, world=WORLD, *words):
+    config = read_run_config(load_config("pendulum-swingup", overrides=list(words)))
+    return earned_by_step(config, phases, world, operations)
+
+
+def test_a_step_of_few_operations_earns_no_graph_and_one_of_many_does():
+    assert by_step(40).saved == 0.0
+    assert not by_step(40).pays
+    assert by_step(2000).pays
+    assert by_step(2000).taken > by_step(1000).taken
+
+
+@pytest.mark.parametrize("name", PHASES)
+def test_every_phase_that_imagines_counts(name):
+    assert 0.0 < by_step(1000, (name,)).saved < by_step(1000).saved
+
+
+def test_a_step_that_nobody_calls_takes_nothing():
+    assert by_step(1000, ("model",)) == by_step(1000, ()) == Earned(0.0, 0.0)
+
+
+def test_a_phase_with_graphs_of_its_own_calls_no_step():
+    config = read_run_config(load_config("pendulum-swingup", preset="paper"))
+    assert earned(config, "policy", config.section("policy"), WORLD).pays
+    assert earned_by_step(config, ("policy",), WORLD, 1000) == Earned(0.0, 0.0)
+
+
+def test_a_run_compiles_the_step_that_it_has_chosen(tmp_path: Path, capfd, monkeypatch) -> None:
+    cheap = {"operations": 1, "seconds": 1e-9, "eager": 1.0, "compiled": 0.0}
+    monkeypatch.setattr(compile_choice, "_ALONE", cheap)
+    compiled = []
+    monkeypatch.setattr(HybridDynamics, "compile_step", lambda self: compiled.append(self))
+    made = run(AUTO, tmp_path / "run")
+    assert "a step of the model is compiled: " in capfd.readouterr().err
+    assert json.loads((made.path / "metadata.json").read_text())["compiled"]["step"]
+    assert len(compiled) == 2  # for both phases after the model's
+    run(replace(CONFIG, compile=False), tmp_path / "without")
+    assert len(compiled) == 2
+
+
 @pytest.mark.parametrize(("method", "phase"), [("td3", "td3"), ("td-mpc", "tdmpc")])
 def test_model_free_methods_have_a_choice_too(method, phase):
     config = read_run_config(load_config("pendulum", method=method, preset="paper"))
@@ -80,7 +123,7 @@ def test_a_run_says_and_keeps_its_choice(tmp_path: Path, capfd, monkeypatch) -> 
     said = capfd.readouterr().err
     assert said.count("policy runs uncompiled: compiling would take about ") == 1
     kept = json.loads((whole.path / "metadata.json").read_text())["compiled"]
-    assert kept == {"model": False, "policy": False, "evaluate": False}
+    assert kept == {"model": False, "policy": False, "step": False, "evaluate": False}
     # Other rates, of a later version, do not change what a begun run has chosen.
     monkeypatch.setattr(compile_choice, "_PHASES", {"policy": lambda *_: Earned(9.0, 1.0)})
     torch._dynamo.utils.counters.clear()

@@ -145,3 +145,26 @@ def test_it_learns_in_any_units():
     assert learn(3000.0, 1 / 3000, "auto") > -20
     assert learn(1 / 3000, 3000.0, "auto") > -20
     assert learn(3000.0, 1.0, "none") < -100, "which is why there are units"
+
+
+def test_rollouts_in_units_are_the_same_prepared():
+    task = cart(4000.0, 1e5)
+    trainer = trainer_in(task)
+    model = trainer.world_model
+    assert type(model.prepared()) is not type(model)
+    state = task.coverage.sample([5])
+    action = torch.zeros(5, 1)
+    with torch.no_grad():
+        found = model.prepared().transition(state, action)
+        for one, other in zip(found, model.transition(state, action), strict=True):
+            torch.testing.assert_close(one, other)
+        seen = model.observe(state)
+        torch.testing.assert_close(model.prepared().observe(state), seen)
+        torch.testing.assert_close(model.prepared().locate(seen), state)
+
+    class Otherwise(type(model)):
+        def observe(self, state):
+            return 2 * super().observe(state)
+
+    model.__class__ = Otherwise
+    assert model.prepared() is model
