@@ -21,17 +21,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from phihp_torchrl import load_agent
+from phihp_torchrl import load_agent, load_config
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.evaluation import TARGETS, markdown_table
-from phihp_torchrl.imagination import Rollouts
+from phihp_torchrl.imagination import Rollouts, make_start_states
 from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.tasks import ActionBounds, Task
-from phihp_torchrl.trainers import Floor
+from phihp_torchrl.trainers import Floor, read_run_config
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/floors")
 SEED, STARTS, UNTRAINED = 0, 64, 5
+WIDE = 4096
 
 Policy = Callable[[Tensor], Tensor]
 
@@ -67,7 +68,9 @@ def measure(name: str, starts: int, untrained: int) -> dict[str, Any]:
     assert agent.actor is not None
     model = TaskWorldModel(task, dynamics)
     states = task.sample_start([starts], torch.Generator().manual_seed(SEED))
-    floor = Floor(model, states, task.max_steps, seed=SEED)
+    start = read_run_config(load_config(name)).section("policy").start
+    wide = make_start_states(task, start).sample([WIDE], torch.Generator().manual_seed(SEED))
+    floor = Floor(model, states, task.max_steps, seed=SEED, wide=wide)
     shares = {
         kind: [floor.share(returns(model, each, states, task.max_steps)) for each in ours]
         for kind, ours in policies(task, agent.actor.module, untrained).items()

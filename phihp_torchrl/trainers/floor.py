@@ -14,6 +14,10 @@ from phihp_torchrl.tasks import ActionBounds
 # A start counts as left at the floor if the actor gains less there than this share of what it
 # gains at its best start.
 _LITTLE = 0.1
+# Or less than this share of what it would gain if all steps had the reward of the best states.
+_PASSING = 0.05
+# Steps are called the best whose reward only this share of steps from anywhere exceeds.
+_BEST = 1e-3
 
 
 class Floor:
@@ -24,13 +28,18 @@ class Floor:
     either of them varies from start to start; the lesser of these deviations is the noise that an
     actor has to exceed, so that a policy under which the system runs away adds none. A sparse
     reward leaves an actor at the floor from most starts,
-    while its mean may already be above the floor because a few starts lie near the goal.
+    while its mean may already be above the floor because a few starts lie near the goal. It also
+    leaves one at the floor that only passes the goal, from starts that all are alike. So an actor
+    that gains a twentieth of what the best states give for as long as an episode lasts is at the
+    floor too. A reward that ends the episode is no state to stay in, and does not count there.
 
     Args:
         world_model: the model, in the units of the trained networks.
         states: the starts, ``[N, n]``.
         steps: steps in a return.
         seed: seed of the random actions, which move no other random numbers.
+        wide: states from anywhere, ``[M, n]``, among which are those of high reward; ``None`` where
+            nobody knows any.
 
     Examples:
         >>> from phihp_torchrl import HybridDynamics, get_task
@@ -43,7 +52,13 @@ class Floor:
 
     @torch.no_grad()
     def __init__(
-        self, world_model: TaskWorldModel, states: Tensor, steps: int, *, seed: int
+        self,
+        world_model: TaskWorldModel,
+        states: Tensor,
+        steps: int,
+        *,
+        seed: int,
+        wide: Tensor | None = None,
     ) -> None:
         task = world_model.task
         generator = torch.Generator(device=states.device).manual_seed(seed)
@@ -66,13 +81,22 @@ class Floor:
         ]
         self.returns = torch.maximum(*totals)
         self.noise = min(float((self.returns - each).std(correction=0)) for each in totals)
+        self.most = torch.full_like(self.returns, -torch.inf)
+        """Gains of an actor that could stay in the best states, ``[N]``."""
+        if wide is not None:
+            action = anything([], wide, task.bounds.to(wide.device))
+            _, reward, ended = world_model.transition(wide, action)
+            kept = reward[reward.isfinite() & ~ended]
+            if len(kept):
+                self.most = steps * kept.quantile(1.0 - _BEST) - self.returns
 
     def share(self, returns: Tensor) -> float:
         """The share of starts at the floor, for an actor's returns ``[N]`` from the same starts."""
         # What left the finite numbers has gained nothing.
         gain = torch.where(returns.isfinite(), returns, -torch.inf) - self.returns
         least = max(self.noise, _LITTLE * float(gain.max()), 0.0)
-        return float((gain <= least).double().mean())
+        passing = gain <= _PASSING * self.most
+        return float(((gain <= least) | passing).double().mean())
 
 
 def _finite(returns: Tensor) -> Tensor:

@@ -35,6 +35,9 @@ from phihp_torchrl.worlds import World
 # Losses are in these powers of the reward's unit, other metrics have none.
 _POWERS = {"loss_actor": 1, "loss_qvalue": 2, "return_range": 1}
 
+# Starts of imagined lives that say which rewards there are.
+_WIDE = 4096
+
 
 class PolicyTrainer:
     """Phase 2: trains actor and critics in imagination (paper, section 4.2).
@@ -140,13 +143,12 @@ class PolicyTrainer:
         )
         self.plateau = None
         if config.patience:
-            starts, steps = self.evaluation.states, self.evaluation.steps
             self.plateau = Plateau(
                 self.schedule,
                 config.patience,
                 config.tail,
                 round_to=config.evaluation_interval,
-                floor=lambda: Floor(self.world_model, starts, steps, seed=seed),
+                floor=lambda: self.floor(self.evaluation.states, self.evaluation.steps, seed),
                 extension=config.extension,
             )
 
@@ -211,6 +213,11 @@ class PolicyTrainer:
         metrics |= self.evaluation.real(self.update.networks.actor)
         self.seconds += time.perf_counter() - start
         return {**metrics, "policy/seconds": self.seconds}
+
+    def floor(self, states: Tensor, steps: int, seed: int) -> Floor:
+        """The floor of returns of ``steps`` steps from these states, in the units of training."""
+        wide = self.start_states.sample([_WIDE], torch.Generator().manual_seed(seed))
+        return Floor(self.world_model, states, steps, seed=seed, wide=wide)
 
     def actor(self) -> TensorDictModule:
         """The actor as it is now."""

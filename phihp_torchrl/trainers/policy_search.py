@@ -218,7 +218,7 @@ class PolicySearch:
         """Look whether the best actor has left the floor, and go on to the next way if not."""
         trainer, steps = self.trainer, self.config.evaluation_steps or self.task.max_steps
         if self._floor is None:
-            self._floor = Floor(trainer.world_model, self._states, steps, seed=self.seed)
+            self._floor = trainer.floor(self._states, steps, self.seed)
             self._unit = trainer.scales.reward
         present = self._present(-math.inf)
         actor = present.layers[: present.actor_layers]

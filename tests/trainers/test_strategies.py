@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from phihp_torchrl import HybridDynamics, get_task
+from phihp_torchrl import Box, HybridDynamics, get_task
 from phihp_torchrl.agents import RefitConfig, TD3Config
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.dynamics import TaskWorldModel
@@ -134,6 +134,24 @@ def test_few_good_starts_do_not_hide_that_most_are_at_the_floor() -> None:
     assert floor.share(floor.returns + 1000.0) == 0.0
     assert floor.share(floor.returns - 1000.0) == 1.0
     assert floor.share(torch.full((10,), float("nan"))) == 1.0
+
+
+def goal_alone(state, action, next_state):
+    return 2.0 * (next_state[..., 0].abs() < 0.1).float()
+
+
+@pytest.mark.parametrize(("ends", "wide", "passed"), [(False, 4096, 1.0), (True, 4096, 0.0),
+                                                      (False, 0, 0.0)])  # fmt: skip
+def test_who_passes_the_goal_from_starts_that_are_alike_is_at_the_floor(ends, wide, passed) -> None:
+    hanging = Box.around((3.1, 0.0), (0.01, 0.01))
+    ended = (lambda state: state[..., 0].abs() < 0.1) if ends else None
+    task = replace(get_task("pendulum"), reset=hanging, reward=goal_alone, terminated=ended)
+    model = TaskWorldModel(task, HybridDynamics.hybrid(task))
+    anywhere = task.coverage.sample([wide]) if wide else None
+    floor = Floor(model, task.reset.sample([10]), 100, seed=0, wide=anywhere)
+    assert floor.share(torch.full((10,), 6.0)) == passed, "three steps of a hundred"
+    assert floor.share(torch.full((10,), 0.0)) == 1.0
+    assert floor.share(torch.full((10,), 20.0)) == 0.0
 
 
 def test_strategies_keep_what_reaches_further_already() -> None:
