@@ -21,8 +21,8 @@ from phihp_torchrl.trainers.strategies import AS_SET, STRATEGIES, strategies_of
 
 _log = logging.getLogger(__name__)
 
-# A way to learn is left half-way if nearly all starts are at the floor, for returns may still rise
-# late; at its end another is tried unless nearly all have left it.
+# A way to learn is left half-way if nearly all starts are at the floor, of episodes and of imagined
+# lives, for returns may still rise late; at its end another is tried unless nearly all have left it.
 _HALF_WAY, _AT_END = 0.9, 0.15
 
 
@@ -44,7 +44,8 @@ class PolicySearch:
     model from starts that are the same for all ways. If it earns no more than an unskilled policy
     (:class:`~phihp_torchrl.trainers.floor.Floor`) from 90 % of the starts half-way, or from more
     than 15 % of them at the end, a warning says so, and the next strategy begins anew, with as many
-    updates. The actor that earns most over all ways is kept.
+    updates. Half-way this must be so from the starts of imagined lives too: some of them lie near a
+    sparse reward, from which skill spreads. The actor that earns most over all ways is kept.
 
     Args:
         task: the task.
@@ -220,19 +221,33 @@ class PolicySearch:
         if self._floor is None:
             self._floor = trainer.floor(self._states, steps, self.seed)
             self._unit = trainer.scales.reward
-        present = self._present(-math.inf)
-        actor = present.layers[: present.actor_layers]
-        returns = trainer.rollouts.returns(actor, self._states, steps).total
+        returns = self._returns(self._states, steps)
         returns = returns * (trainer.scales.reward / self._unit)  # the floor's unit
         share = self._floor.share(returns)
         score = float(torch.where(returns.isfinite(), returns, -math.inf).mean()) * self._unit
-        stuck = share > _AT_END if at_end else share >= _HALF_WAY
+        if at_end:
+            stuck = share > _AT_END
+        else:
+            stuck = share >= _HALF_WAY and self._share_of_lives(steps) >= _HALF_WAY
         if at_end or stuck:
             if self.best is None or score >= self.best.score:
                 self.best = self._present(score)
                 self.stuck = share > _AT_END
             self._end(stuck, share, score)
         return {"policy/at_floor": share}
+
+    def _share_of_lives(self, steps: int) -> float:
+        """The share of starts of imagined lives from which the present way is at the floor."""
+        generator, trainer = torch.Generator().manual_seed(self.seed), self.trainer
+        lives = trainer.start_states.sample([len(self._states)], generator)
+        floor = trainer.floor(lives, steps, self.seed)
+        return floor.share(self._returns(lives, steps))
+
+    def _returns(self, states: Tensor, steps: int) -> Tensor:
+        """What the best actor of the present way earns in the model, in its own units."""
+        trainer = self.trainer
+        actor = trainer.best[: len(trainer.update.actor)]
+        return trainer.rollouts.returns(actor, states, steps).total
 
     def _end(self, stuck: bool, share: float, score: float) -> None:
         """End the present way: begin the next one if it is stuck, or say what has worked."""

@@ -72,13 +72,21 @@ def test_a_reward_that_is_never_met_is_said_and_every_strategy_tried(
 
 
 def test_an_actor_above_the_floor_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    shares = iter([1.0, 0.2, 0.1])
+    shares = iter([1.0, 1.0, 0.2, 0.1])  # half-way of episodes and of lives; both ends
     monkeypatch.setattr(Floor, "share", lambda self, returns: next(shares))
     phase = search(sparse(never), replace(TINY, td3=replace(TINY.td3, gamma=0.5)))
     rows = run(phase)
     assert [row["policy/strategy"] for row in rows] == [0, 0, 1, 1, 1, 1]
     assert phase.summary == {"tried": ["as-set", "further"], "kept": "further", "at_floor": False}
     assert phase.planner_changes == {"gamma": math.exp(-0.5)}  # the critics' discount
+
+
+def test_skill_near_the_goal_is_given_time_to_spread(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares = iter([1.0, 0.8, 0.1])
+    monkeypatch.setattr(Floor, "share", lambda self, returns: next(shares))
+    phase = search(sparse(never))
+    assert [row["policy/strategy"] for row in run(phase)] == [0, 0, 0, 0]
+    assert phase.summary == {"tried": ["as-set"], "kept": "as-set", "at_floor": False}
 
 
 def test_none_of_it_changes_what_is_learned_where_nothing_is_stuck(
