@@ -21,7 +21,7 @@ from phihp_torchrl.trainers.strategies import AS_SET, STRATEGIES, strategies_of
 
 _log = logging.getLogger(__name__)
 
-# A way to learn is left half-way if nearly all starts, of episodes and of imagined lives, are at the
+# A way to learn is left half-way if nearly all starts, of episodes and of lives, are at the
 # floor, for returns may still rise late; at its end unless nearly all of episodes have left it.
 _HALF_WAY, _AT_END = 0.9, 0.15
 
