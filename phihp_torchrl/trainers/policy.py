@@ -50,8 +50,8 @@ class PolicyTrainer:
     world are only logged; neither they nor seeds of evaluation affect that choice.
 
     At the updates that ``config.refit`` sets, the critics of the best actor so far are fitted to
-    its returns in the model, and training continues from these. The last fit gives the critics that
-    the planner uses.
+    its returns in the model, unless they were for that actor before, and training continues from
+    these. The last fit gives the critics that the planner uses.
 
     With ``config.scales`` the networks are trained in units that are measured from the task's
     coverage. The actors and critics that this returns, and its metrics, are in physical units.
@@ -131,6 +131,7 @@ class PolicyTrainer:
         )
         self.best = [layer.clone() for layer in self._layers()]
         self.best_return = -math.inf
+        self._is_fitted = False  # the best critics, to the best actor's returns
         self.seconds = 0.0
         self.evaluation = ActorEvaluation(
             self.rollouts,
@@ -194,6 +195,7 @@ class PolicyTrainer:
         if -math.inf < imagined >= self.best_return:
             self.best_return = imagined
             self._keep(self._layers())
+            self._is_fitted = False
         unit = self.scales.reward
         metrics = {
             "policy/updates": float(self.updates),
@@ -249,6 +251,7 @@ class PolicyTrainer:
             "scales": vars(self.scales).copy(),
             "best": list(self.best),
             "best_return": self.best_return,
+            "is_fitted": self._is_fitted,
             "evaluation_states": self.evaluation.states,
             "world_states": self.evaluation.world_states,
             **({} if self.shifts is None else {"shifts": self.shifts}),
@@ -271,6 +274,7 @@ class PolicyTrainer:
         if self.plateau is not None and "plateau" in state:  # older checkpoints go to their end
             self.plateau.load_state_dict(state["plateau"])
         self.best_return = state["best_return"]
+        self._is_fitted = state.get("is_fitted", False)  # older checkpoints fit again
         self.evaluation.states = state["evaluation_states"]
         self.evaluation.world_states = state["world_states"]
 
@@ -279,12 +283,16 @@ class PolicyTrainer:
             kept.copy_(layer)
 
     def _refit_critics(self) -> dict[str, float]:
-        """Fit the best actor's critics to its returns, and go on from these."""
+        """Fit the best actor's critics to its returns, once, and go on from these."""
         count = len(self.update.networks.actor)
         actor, critics = self.best[:count], self.best[count:]
+        if self._is_fitted:
+            self.update.restart(actor, critics)
+            return {}
         visited = self.learner.visited(self.config.refit.transitions)
         refit = self.refit(actor, critics, *visited, self.learner.generator)
         self._keep([*actor, *refit.critics])
+        self._is_fitted = True
         self.update.restart(actor, refit.critics)
         return {
             "policy/critic_lag": self.scales.reward * refit.lag,

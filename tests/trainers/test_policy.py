@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 
 from phihp_torchrl import HybridDynamics
-from phihp_torchrl.agents import act
+from phihp_torchrl.agents import RefitConfig, act
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.imagination import Rollouts, StartConfig
 from phihp_torchrl.trainers import PolicyTrainer
@@ -207,3 +207,26 @@ def test_rates_decay_at_the_end(monkeypatch):
     trainer.advance()
     expected = [1.0] * 11 + [1 - k / 10 for k in range(1, 10)]
     assert scales == pytest.approx(expected)
+
+
+def test_critics_are_fitted_once_to_each_best_actor():
+    refit = RefitConfig(start=4, interval=4, transitions=32, horizon=3, steps=2, batch_size=16)
+    trainer = policy_trainer(replace(POLICY, updates=16, refit=refit))
+    returns = iter([1.0, 1.0, 0.0, 2.0])
+    trainer.evaluation.imagined = lambda actor: torch.full((3,), next(returns))
+    fitted, kept = [], []
+    while not trainer.done:
+        state = copy.deepcopy(trainer.state_dict())
+        fitted.append("policy/critic_error" in trainer.advance())
+        kept.append([layer.clone() for layer in trainer.best])
+        ours = [*trainer.update.networks.actor, *trainer.update.networks.critics]
+        assert all(torch.equal(*pair) for pair in zip(ours, trainer.best, strict=True))
+    # At the same return as the best, a later actor takes its place.
+    assert fitted == [True, True, False, True]
+    assert all(torch.equal(*pair) for pair in zip(kept[1], kept[2], strict=True))
+    assert state["is_fitted"]
+    trainer.load_state_dict(state)
+    assert trainer._is_fitted
+    del state["is_fitted"]  # a checkpoint from before
+    trainer.load_state_dict(state)
+    assert not trainer._is_fitted
