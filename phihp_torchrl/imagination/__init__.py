@@ -5,6 +5,7 @@ from __future__ import annotations
 from phihp_torchrl.imagination.generator_state import Packed, pack_generator, unpack_generator
 from phihp_torchrl.imagination.given_starts import GivenStarts
 from phihp_torchrl.imagination.latent_model_env import LatentModelEnv
+from phihp_torchrl.imagination.rewarding_states import rewarding_states
 from phihp_torchrl.imagination.rollouts import (
     ChunkNoise,
     Policy,
@@ -40,4 +41,5 @@ __all__ = [
     "TaskStates",
     "WorldModelEnv",
     "make_start_states",
+    "rewarding_states",
 ]

@@ -146,7 +146,7 @@ class MixtureStates:
 
 @dataclass(frozen=True)
 class StartConfig:
-    """Where imagined episodes start: the shares of four kinds of start states.
+    """Where imagined episodes start: the shares of five kinds of start states.
 
     The shares are divided by their sum.
 
@@ -155,6 +155,7 @@ class StartConfig:
         data: share that starts in states of the real data.
         coverage: share that starts anywhere in the task's coverage box.
         goal: share that starts in the box around the task's goal, if it has one.
+        rewarding: share that starts in the states of the coverage box that earn most at once.
         growth: share of the updates after which the box around the goal has grown to the coverage
             box; 0 leaves it as it is.
 
@@ -172,16 +173,20 @@ class StartConfig:
     data: float = 0.0
     coverage: float = 0.6
     goal: float = 0.2
+    rewarding: float = 0.0
     growth: float = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
-        check_not_negative(self, "reset", "data", "coverage", "goal")
+        check_not_negative(self, "reset", "data", "coverage", "goal", "rewarding")
         check_share(self, "growth")
 
 
 def make_start_states(
-    task: Task, shares: StartConfig | None = None, states: Tensor | DataStates | None = None
+    task: Task,
+    shares: StartConfig | None = None,
+    states: Tensor | DataStates | None = None,
+    rewarding: Tensor | None = None,
 ) -> MixtureStates:
     """Make the start states of a task by shares; a box that the task lacks gets no share.
 
@@ -189,6 +194,7 @@ def make_start_states(
         task: the task, with its boxes.
         shares: the share of each kind of start states. Defaults to ``StartConfig()``.
         states: states of real data, ``[N, n]``, or a :class:`DataStates` that is updated elsewhere.
+        rewarding: states of high reward, ``[N, n]``, as ``rewarding_states`` finds them.
 
     Raises:
         ConfigError: if no share is positive, and for ``data`` > 0 without ``states``.
@@ -213,6 +219,8 @@ def make_start_states(
     }
     if states is not None:
         samplers["data"] = states if isinstance(states, DataStates) else DataStates(states)
+    if rewarding is not None:
+        samplers["rewarding"] = DataStates(rewarding)
     present = {name: getattr(shares, name) for name in samplers}
     if not any(present.values()):
         raise ConfigError(

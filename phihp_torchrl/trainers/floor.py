@@ -15,7 +15,7 @@ from phihp_torchrl.tasks import ActionBounds
 # gains at its best start.
 _LITTLE = 0.1
 # Or less than this share of what it would gain if all steps had the reward of the best states.
-_PASSING = 0.05
+_PASSING = 0.1
 # Steps are called the best whose reward only this share of steps from anywhere exceeds.
 _BEST = 1e-3
 
@@ -29,9 +29,10 @@ class Floor:
     actor has to exceed, so that a policy under which the system runs away adds none. A sparse
     reward leaves an actor at the floor from most starts,
     while its mean may already be above the floor because a few starts lie near the goal. It also
-    leaves one at the floor that only passes the goal, from starts that all are alike. So an actor
-    that gains a twentieth of what the best states give for as long as an episode lasts is at the
-    floor too. A reward that ends the episode is no state to stay in, and does not count there.
+    leaves one at the floor that only passes the goal, again and again, or from starts that all are
+    alike. So an actor that gains a tenth of what the best states give for as long as an episode
+    lasts is at the floor too. A reward that ends the episode is no state to stay in, and does not
+    count there.
 
     Args:
         world_model: the model, in the units of the trained networks.

@@ -21,7 +21,7 @@ from phihp_torchrl.agents import (
 )
 from phihp_torchrl.config import resolve_seconds
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel, per_life
-from phihp_torchrl.imagination import Rollouts, make_start_states
+from phihp_torchrl.imagination import Rollouts, make_start_states, rewarding_states
 from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.drawn_constants import draw_constants
 from phihp_torchrl.trainers.floor import Floor
@@ -108,9 +108,11 @@ class PolicyTrainer:
         self.task = task
         self.config = config = resolve_seconds(config, task.time_step)
         self.shifts = draw_constants(dynamics, config, covariance, seed)
-        self.start_states = make_start_states(task, config.start, states=data_states)
-        start_states = self.start_states
         model = TaskWorldModel(task, per_life(dynamics, self.shifts))
+        found = config.start.rewarding and task.coverage is not None
+        best = rewarding_states(model, seed=seed) if found else None
+        self.start_states = make_start_states(task, config.start, data_states, best)
+        start_states = self.start_states
         self.scales = training_scales(model, start_states, config, seed)
         self.world_model = scaled(model, self.scales)
         self.rollouts = Rollouts(self.world_model, act, self.max_age, compile=compile)

@@ -50,7 +50,7 @@ def check_run(config: RunConfig, world: World) -> None:
         strategies_of(policy)  # refuses unknown ones
         data = torch.zeros(1, task.state_dim)  # phase 1 will have collected some
         try:
-            make_start_states(task, policy.start, data)
+            make_start_states(task, policy.start, data, None if task.coverage is None else data)
         except ConfigError as error:
             raise ConfigError("policy.start", error.reason) from error
     if getattr(config.sections.get("policy"), "draw_constants", False):

@@ -82,26 +82,32 @@ def start_wider(config: PolicyConfig, task: Task) -> PolicyConfig:
     """
     if task.coverage is None:
         return config
-    start = replace(config.start, reset=0.1, coverage=0.9, data=0.0, goal=0.0)
+    start = replace(config.start, reset=0.1, coverage=0.9, data=0.0, goal=0.0, rewarding=0.0)
     return replace(look_further(config, task), start=start, random_fraction=0.3)
 
 
 def start_at_goal(config: PolicyConfig, task: Task) -> PolicyConfig:
-    """As :func:`look_further`, with most starts near the goal, from which the reward is met.
+    """As :func:`look_further`, with most starts where the reward is met.
+
+    That is the task's goal box, or else the states of its coverage box that earn most at once
+    (:func:`~phihp_torchrl.imagination.rewarding_states`).
 
     Args:
         config: settings of the phase.
-        task: the task; without a goal box there is nothing to start near.
+        task: the task; without either box there is nothing to start near.
 
     Examples:
         >>> from phihp_torchrl import get_task
         >>> start_at_goal(PolicyConfig(), get_task("cartpole-swingup")).start.goal
         0.6
+        >>> start_at_goal(PolicyConfig(), get_task("pendulum")).start.rewarding
+        0.6
     """
-    if task.goal is None:
+    if task.goal is None and task.coverage is None:
         return config
-    start = replace(config.start, reset=0.2, coverage=0.2, data=0.0, goal=0.6)
-    return replace(look_further(config, task), start=start)
+    kind = "rewarding" if task.goal is None else "goal"
+    start = replace(config.start, reset=0.2, coverage=0.2, data=0.0, goal=0.0, rewarding=0.0)
+    return replace(look_further(config, task), start=replace(start, **{kind: 0.6}))
 
 
 def start_backwards(config: PolicyConfig, task: Task) -> PolicyConfig:
@@ -118,7 +124,8 @@ def start_backwards(config: PolicyConfig, task: Task) -> PolicyConfig:
     """
     if task.goal is None or task.coverage is None:
         return config
-    start = replace(config.start, reset=0.1, coverage=0.0, data=0.0, goal=0.9, growth=_GROWTH)
+    start = replace(config.start, reset=0.1, coverage=0.0, data=0.0, goal=0.9, rewarding=0.0)
+    start = replace(start, growth=_GROWTH)
     return replace(look_further(config, task), start=start)
 
 
@@ -147,8 +154,8 @@ def learn_by_gradients(config: PolicyConfig, task: Task) -> PolicyConfig:
 STRATEGIES: Registry[Strategy] = Registry("policy.strategies")
 """Strategies by name, in the order in which ``auto`` tries them."""
 
+STRATEGIES.register("goal", Strategy("starts where the reward is met", start_at_goal))
 STRATEGIES.register("further", Strategy("looks further ahead", look_further))
-STRATEGIES.register("goal", Strategy("starts near the goal", start_at_goal))
 STRATEGIES.register("wide", Strategy("starts everywhere", start_wider))
 STRATEGIES.register("backwards", Strategy("starts ever further from the goal", start_backwards))
 STRATEGIES.register("analytic", Strategy("learns by gradients", learn_by_gradients))
@@ -162,7 +169,7 @@ def strategies_of(config: PolicyConfig) -> tuple[str, ...]:
 
     Examples:
         >>> strategies_of(PolicyConfig()), strategies_of(PolicyConfig(strategies="none"))
-        (('further', 'goal', 'wide', 'backwards', 'analytic'), ())
+        (('goal', 'further', 'wide', 'backwards', 'analytic'), ())
     """
     asked = config.strategies
     if isinstance(asked, str):
