@@ -155,7 +155,8 @@ class StartConfig:
         data: share that starts in states of the real data.
         coverage: share that starts anywhere in the task's coverage box.
         goal: share that starts in the box around the task's goal, if it has one.
-        rewarding: share that starts in the states of the coverage box that earn most at once.
+        rewarding: share that starts in the states of the coverage box that earn most at once, or
+            around them.
         growth: share of the updates after which the box around the goal has grown to the coverage
             box; 0 leaves it as it is.
 

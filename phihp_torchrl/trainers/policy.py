@@ -37,6 +37,8 @@ _POWERS = {"loss_actor": 1, "loss_qvalue": 2, "return_range": 1}
 
 # Starts of imagined lives that say which rewards there are.
 _WIDE = 4096
+# Steps of random actions that lead to starts around those of high reward.
+_AROUND = 50
 
 
 class PolicyTrainer:
@@ -110,7 +112,7 @@ class PolicyTrainer:
         self.shifts = draw_constants(dynamics, config, covariance, seed)
         model = TaskWorldModel(task, per_life(dynamics, self.shifts))
         found = config.start.rewarding and task.coverage is not None
-        best = rewarding_states(model, seed=seed) if found else None
+        best = rewarding_states(model, around=_AROUND, seed=seed) if found else None
         self.start_states = make_start_states(task, config.start, data_states, best)
         start_states = self.start_states
         self.scales = training_scales(model, start_states, config, seed)

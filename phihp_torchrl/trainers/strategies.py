@@ -89,8 +89,8 @@ def start_wider(config: PolicyConfig, task: Task) -> PolicyConfig:
 def start_at_goal(config: PolicyConfig, task: Task) -> PolicyConfig:
     """As :func:`look_further`, with most starts where the reward is met.
 
-    That is the task's goal box, or else the states of its coverage box that earn most at once
-    (:func:`~phihp_torchrl.imagination.rewarding_states`).
+    That is the task's goal box, or else the states of its coverage box that earn most at once, and
+    those around them (:func:`~phihp_torchrl.imagination.rewarding_states`).
 
     Args:
         config: settings of the phase.

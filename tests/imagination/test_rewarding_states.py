@@ -51,6 +51,19 @@ def test_a_reward_that_ends_an_episode_is_met_from_before_it():
     assert met.all()
 
 
+def test_random_actions_lead_to_states_around():
+    model = model_of()
+    best = rewarding_states(model)
+    found = rewarding_states(model, around=60)
+    assert torch.equal(found[: 60 * 256], best.repeat(60, 1)), "half of them"
+    assert found.shape == (2 * 60 * 256, 2)
+    fallen = found[-256:]
+    assert fallen[:, 0].abs().max() > 2.0, "some have fallen"
+    assert fallen.unique(dim=0).shape[0] == 256
+    nowhere = model_of(terminated=lambda state: state[..., 0].abs() > -1.0)
+    assert rewarding_states(nowhere, around=60).unique(dim=0).shape == (256, 2)
+
+
 def test_what_is_not_finite_is_not_among_them():
     def reward(state, action, next_state):
         return torch.where(next_state[..., 0] > 1.0, torch.nan, upright(state, action, next_state))
