@@ -68,7 +68,9 @@ class Earned:
         return f"{name} runs uncompiled: compiling would take about {taken} and save {saved}."
 
 
-def earned(config: RunConfig, name: str, settings: Any, world: World) -> Earned:
+def earned(
+    config: RunConfig, name: str, settings: Any, world: World, *, step: bool = False
+) -> Earned:
     """What compiling would save in a phase of a run.
 
     Args:
@@ -77,6 +79,8 @@ def earned(config: RunConfig, name: str, settings: Any, world: World) -> Earned:
             compiled.
         settings: its section, with times in steps.
         world: the world.
+        step: whether a step of the model is compiled. Plans then call that; a graph of a plan has a
+            dear step many times over, and takes ever longer to compile.
 
     Examples:
         >>> from phihp_torchrl import load_config, make_world
@@ -88,7 +92,7 @@ def earned(config: RunConfig, name: str, settings: Any, world: World) -> Earned:
         >>> found
         [False, True]
     """
-    of = _PHASES.get(name)
+    of = None if step and name in _PLANS else _PHASES.get(name)
     return of(config, settings, world) if of else Earned(0.0, 0.0)
 
 
@@ -114,7 +118,7 @@ def earned_by_step(
     calls = 0.0
     for name in phases:
         settings = resolve_seconds(config.section(name), world.task.time_step)
-        if name in _STEPS and not earned(config, name, settings, world).pays:
+        if name in _STEPS and not earned(config, name, settings, world, step=True).pays:
             calls += _STEPS[name](config, settings, world)
     each = operations / _ALONE["operations"]
     saved = max(0.0, each * _ALONE["eager"] - _ALONE["compiled"])
@@ -205,6 +209,7 @@ _PHASES: dict[str, Callable[[RunConfig, Any, World], Earned]] = {
     "tdmpc": _tdmpc,
     "evaluate": _evaluate,
 }
+_PLANS = ("calibrate", "evaluate")
 _STEPS: dict[str, Callable[[RunConfig, Any, World], float]] = {
     "policy": _policy_steps,
     "calibrate": _calibrate_steps,

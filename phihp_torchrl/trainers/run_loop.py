@@ -126,8 +126,8 @@ class RunLoop:
             known = getattr(phase, "world", None)
             world = known if isinstance(known, World) else world
         settings = resolve_seconds(self.config.section(name), world.task.time_step)
-        compiled = self._compiles(name, settings, world)
         self._compile_step(name, world)
+        compiled = self._compiles(name, settings, world)
         context = Context(
             config=self.config,
             settings=settings,
@@ -145,7 +145,8 @@ class RunLoop:
             return self.config.compile
         chosen = self.record.metadata.setdefault("compiled", {})
         if name not in chosen:
-            found = earned(self.config, name, settings, world)
+            step = bool(chosen.get("step"))
+            found = earned(self.config, name, settings, world, step=step)
             chosen[name] = found.pays
             if found.taken and name in self.config.phases_to_do:
                 self.progress.say(found.words(name))
@@ -156,7 +157,7 @@ class RunLoop:
         dynamics = getattr(self.phases.get("model"), "dynamics", None)
         if self.config.compile != "auto" or not isinstance(dynamics, HybridDynamics):
             return
-        chosen = self.record.metadata["compiled"]
+        chosen = self.record.metadata.setdefault("compiled", {})
         if "step" not in chosen:
             to_do = self.config.phases_to_do
             left = to_do[to_do.index(name) :] if name in to_do else to_do

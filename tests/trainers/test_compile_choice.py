@@ -92,6 +92,15 @@ def test_a_phase_with_graphs_of_its_own_calls_no_step():
     assert earned_by_step(config, ("policy",), WORLD, 1000) == Earned(0.0, 0.0)
 
 
+def test_plans_that_call_a_compiled_step_have_no_graph_of_their_own():
+    alone: Any = SimpleNamespace(truth=None, has_env=True, task=WORLD.task)
+    config = read_run_config(load_config("pendulum-swingup"))
+    section = config.section("evaluate")
+    assert earned(config, "evaluate", section, alone).pays
+    assert earned(config, "evaluate", section, alone, step=True) == Earned(0.0, 0.0)
+    assert by_step(600, ("evaluate",), alone).saved > by_step(600, ("evaluate",)).saved > 0.0
+
+
 def test_a_run_compiles_the_step_that_it_has_chosen(tmp_path: Path, capfd, monkeypatch) -> None:
     cheap = {"operations": 1, "seconds": 1e-9, "eager": 1.0, "compiled": 0.0}
     monkeypatch.setattr(compile_choice, "_ALONE", cheap)
