@@ -41,5 +41,4 @@ __all__ = [
     "TaskStates",
     "WorldModelEnv",
     "make_start_states",
-    "rewarding_states",
 ]

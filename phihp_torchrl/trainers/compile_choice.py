@@ -112,7 +112,7 @@ def earned_by_step(
         >>> from phihp_torchrl.trainers import read_run_config
         >>> world, config = make_world("pendulum"), read_run_config(load_config("pendulum"))
         >>> phases = ("policy", "calibrate", "evaluate")
-        >>> [earned_by_step(config, phases, world, count).pays for count in (50, 1000)]
+        >>> [earned_by_step(config, phases, world, count).pays for count in (50, 5000)]
         [False, True]
     """
     calls = 0.0

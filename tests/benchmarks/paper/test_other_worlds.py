@@ -18,12 +18,6 @@ HAS_DM_CONTROL = importlib.util.find_spec("dm_control") is not None
 needs_dm_control = pytest.mark.skipif(
     not HAS_DM_CONTROL, reason="dm_control is not installed (the extra 'dmcontrol')"
 )
-CASES = [
-    pytest.param(name, marks=[needs_dm_control] if name.startswith("dm_control") else [])
-    for name in WORLDS
-]
-
-
 TRUTH = {
     "dm_control cartpole": {
         "cart_mass": 1.0,
@@ -46,6 +40,11 @@ TRUTH = {
     "gymnasium MountainCarContinuous-v0 as it is": {"motor": 0.0015, "slope": 0.0025},
     "gymnasium Pendulum-v1": {"mass": 1.0, "length": 1.0},
 }
+CASES = [
+    pytest.param(name, marks=[needs_dm_control] if name.startswith("dm_control") else [])
+    for name in TRUTH
+]
+OF_THE_CARTPOLE = [name for name in WORLDS if name.startswith("dm_control cartpole")]
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -91,6 +90,24 @@ def test_the_textbook_with_true_constants_predicts_and_the_guesses_do_not(name):
     assert guessed["overall"]["all"] > 2 * found["overall"]["all"]
     if name == "dm_control cartpole":  # it has met its stop
         assert found["away"]["windows"] < found["overall"]["windows"]
+
+
+@needs_dm_control
+@pytest.mark.parametrize("name", OF_THE_CARTPOLE)
+def test_the_cartpoles_differ_in_start_and_reward_alone(name):
+    world = WORLDS[name]
+    task = world.task
+    data = played(world, pushed(world), 40)
+    state, after = task.locate(data["observation"]), task.locate(data["next", "observation"])
+    assert (state[0, 2].abs() > 3.0) == ("balance" not in name)
+    told = task.reward(state, data["action"], after)
+    found = data["next", "reward"].squeeze(-1)
+    if "sparse" in name:  # a reward is met or left between two steps of the simulator
+        assert (told != found).sum() <= 1
+        assert set(told.unique().tolist()) <= {0.0, 2.0}
+        assert (found.sum() > 0) == ("balance" in name)
+    else:
+        torch.testing.assert_close(told, found, atol=0.05, rtol=0.0)
 
 
 @needs_dm_control
