@@ -110,9 +110,10 @@ def earned_by_step(
     Examples:
         >>> from phihp_torchrl import load_config, make_world
         >>> from phihp_torchrl.trainers import read_run_config
-        >>> world, config = make_world("pendulum"), read_run_config(load_config("pendulum"))
+        >>> task = "cartpole-swingup"
+        >>> world, config = make_world(task), read_run_config(load_config(task))
         >>> phases = ("policy", "calibrate", "evaluate")
-        >>> [earned_by_step(config, phases, world, count).pays for count in (50, 5000)]
+        >>> [earned_by_step(config, phases, world, count).pays for count in (50, 1000)]
         [False, True]
     """
     calls = 0.0

@@ -17,6 +17,7 @@ AS_SET = "as-set"
 # other swing-ups of 10 to 30 s is found, whatever their time steps.
 _CONSTANT, _LIFE, _EXPANSION = 0.4, 0.6, 0.01
 _MOST_EXPANDED, _LEAST_EXPANDED = 5, 3
+_WORLDS = 4  # times the imagined worlds
 _GROWTH = 0.6  # share of the updates within which starts reach the coverage box
 
 
@@ -90,7 +91,9 @@ def start_at_goal(config: PolicyConfig, task: Task) -> PolicyConfig:
     """As :func:`look_further`, with most starts where the reward is met.
 
     That is the task's goal box, or else the states of its coverage box that earn most at once, and
-    those around them (:func:`~phihp_torchrl.imagination.rewarding_states`).
+    those around them (:func:`~phihp_torchrl.imagination.rewarding_states`). There are four times
+    as many imagined worlds, for such lives differ, and the critics are fitted at the end alone: to
+    go on from the best actor so far, again and again, would hold up what returns show last.
 
     Args:
         config: settings of the phase.
@@ -107,7 +110,14 @@ def start_at_goal(config: PolicyConfig, task: Task) -> PolicyConfig:
         return config
     kind = "rewarding" if task.goal is None else "goal"
     start = replace(config.start, reset=0.2, coverage=0.2, data=0.0, goal=0.0, rewarding=0.0)
-    return replace(look_further(config, task), start=replace(start, **{kind: 0.6}))
+    every, end = config.evaluation_interval, (1.0 + config.extension) * config.updates
+    refit = replace(config.refit, start=every * math.ceil(end / every))
+    return replace(
+        look_further(config, task),
+        start=replace(start, **{kind: 0.6}),
+        num_worlds=_WORLDS * config.num_worlds,
+        refit=refit,
+    )
 
 
 def start_backwards(config: PolicyConfig, task: Task) -> PolicyConfig:

@@ -174,6 +174,19 @@ def test_who_passes_the_goal_from_starts_that_are_alike_is_at_the_floor(ends, wi
     assert floor.share(torch.full((10,), 25.0)) == 0.0
 
 
+@pytest.mark.parametrize("extension", [0.0, 0.3, 1.0])
+def test_starts_where_the_reward_is_met_are_many_and_critics_wait_for_the_end(extension) -> None:
+    config = PolicyConfig(updates=4400, extension=extension)
+    for name, kind in (("pendulum", "rewarding"), ("cartpole-swingup", "goal")):
+        changed = STRATEGIES["goal"].change(config, get_task(name))
+        assert changed.num_worlds == 4 * config.num_worlds
+        assert (getattr(changed.start, kind), changed.start.reset) == (0.6, 0.2)
+        end = 4400 * (1 + extension)
+        assert not any(changed.refit.is_due(k, int(end)) for k in range(500, int(end), 500))
+        assert changed.refit.is_due(int(end), int(end))
+    assert STRATEGIES["goal"].change(config, replace(get_task("pendulum"), coverage=None)) is config
+
+
 def test_strategies_keep_what_reaches_further_already() -> None:
     far = replace(TINY, td3=replace(TINY.td3, gamma=0.999, value_expansion=9), max_age=7)
     task = get_task("pendulum")
