@@ -24,10 +24,10 @@ def traced(monkeypatch):
     monkeypatch.setattr(compiled_step, "compile_graph", quick)
 
 
-def made(name="cartpole", integrator=None, **system):
+def made(name="cartpole", integrator=None):
     torch.manual_seed(0)
     task = get_task(name)
-    return HybridDynamics.hybrid(task, integrator=integrator or RK4(substeps=2))
+    return HybridDynamics.hybrid(task, integrator=integrator or "rk4")
 
 
 def drawn(dynamics, rows):
@@ -35,7 +35,7 @@ def drawn(dynamics, rows):
     return task.coverage.sample([rows]), task.action_high[0] * torch.randn(rows, task.action_dim)
 
 
-@pytest.mark.parametrize("name", ["pendulum", "cartpole-swingup", "acrobot"])
+@pytest.mark.parametrize("name", ["pendulum", "acrobot"])
 def test_it_is_the_step_for_any_number_of_rows(traced, name):
     dynamics = made(name)
     dynamics.compile_step()
