@@ -21,8 +21,8 @@ class CompiledStep:
 
     A graph of a whole plan or of a chunk of imagination has the step many times over. This one has
     it once, so that it compiles sooner, in proportion, and all of them call it. It pays where a
-    step has hundreds of operations, as with Runge-Kutta and substeps: 192 rows of a cart-pole with
-    soft stops, at two substeps of RK4, take 4 times as long without it, and two rows 7 times.
+    step has hundreds of operations, as with Runge-Kutta and substeps: 192 rows of a cart-pole, at
+    two substeps of RK4, take 2.4 times as long without it (``benchmarks/speed/compiling.py``).
 
     Args:
         step: ``(state [rows, n], action [rows, m]) -> next state [rows, n]``. Weights that it

@@ -208,8 +208,8 @@ class HybridDynamics(nn.Module):
     def compile_step(self) -> None:
         """Let plans and imagination that are not compiled themselves use a compiled :meth:`step`.
 
-        The first of them compiles it, which takes about a tenth of a second for each of its
-        operations. Its results are those of :meth:`step` up to rounding. It serves calls without
+        The first of them compiles it, which takes about 0.06 s for each of its operations
+        (``benchmarks/speed/compiling.py``). Its results are those of :meth:`step` up to rounding. It serves calls without
         gradients; a copy of the model does not have it. Nothing happens with an adaptive
         integrator, which does not compile.
         """

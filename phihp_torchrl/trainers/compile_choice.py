@@ -92,7 +92,7 @@ def earned(
         >>> found
         [False, True]
     """
-    of = None if step and name in _PLANS else _PHASES.get(name)
+    of = None if step and name == "evaluate" else _PHASES.get(name)
     return of(config, settings, world) if of else Earned(0.0, 0.0)
 
 
@@ -210,7 +210,6 @@ _PHASES: dict[str, Callable[[RunConfig, Any, World], Earned]] = {
     "tdmpc": _tdmpc,
     "evaluate": _evaluate,
 }
-_PLANS = ("calibrate", "evaluate")
 _STEPS: dict[str, Callable[[RunConfig, Any, World], float]] = {
     "policy": _policy_steps,
     "calibrate": _calibrate_steps,

@@ -149,6 +149,6 @@ def test_rows_below_two_share_the_graph():
     step = CompiledStep(lambda state, action: state + action)
     step._step = lambda state, action: seen.append(len(state)) or state + action
     assert step(torch.ones(1, 2), torch.ones(1, 2)).tolist() == [[2.0, 2.0]]
-    assert step(torch.ones(0, 2).new_ones(1, 2), torch.zeros(1, 2)).shape == (1, 2)
+    assert step(torch.ones(1, 2), torch.zeros(1, 2)).shape == (1, 2)
     assert seen == [2, 2]
     assert count_operations(lambda s, a: s * 2 + a, torch.ones(2), torch.ones(2)) == 2
