@@ -209,9 +209,9 @@ class HybridDynamics(nn.Module):
         """Let plans and imagination that are not compiled themselves use a compiled :meth:`step`.
 
         The first of them compiles it, which takes about 0.06 s for each of its operations
-        (``benchmarks/speed/compiling.py``). Its results are those of :meth:`step` up to rounding. It serves calls without
-        gradients; a copy of the model does not have it. Nothing happens with an adaptive
-        integrator, which does not compile.
+        (``benchmarks/speed/compiling.py``). Its results are those of :meth:`step` up to rounding.
+        It serves calls without gradients; a copy of the model does not have it. Nothing happens
+        with an adaptive integrator, which does not compile.
         """
         if self.integrator.compiles and self.compiled_step is None:
             self.compiled_step = CompiledStep(lambda state, action: self.step(state, action))
