@@ -135,11 +135,41 @@ def critic_loss(
     return error.square().sum(0).mean()
 
 
-def actor_loss(actor: Layers, critics: Layers, observation: Tensor, bounds: ActionBounds) -> Tensor:
-    """-Q1(s, pi(s)), averaged over the batch."""
-    action = act(actor, observation, bounds)
+SATURATED = 2.0
+"""Output of an actor before its tanh, from which on a price may be set: 96 % of the half-range."""
+
+
+def actor_loss(
+    actor: Layers,
+    critics: Layers,
+    observation: Tensor,
+    bounds: ActionBounds,
+    saturation_cost: float = 0.0,
+) -> Tensor:
+    r"""-Q1(s, pi(s)), averaged over the batch, and the price of saturated outputs.
+
+    .. math::
+        -\overline{Q_1(s, \pi(s))} + c\, \sigma(Q_1)\, \overline{\max(|u| - 2, 0)^2}
+
+    u is the actor's output before its tanh. Where that is far out, the slope of tanh is 0, and no
+    value that the critics find later reaches the actor any more (Wang et al., 2020,
+    arXiv:1910.02208).
+
+    Args:
+        actor: layers of the actor.
+        critics: layers of the critics, of which the first is used.
+        observation: observations ``[N, o]``.
+        bounds: bounds of the action.
+        saturation_cost: c, in standard deviations σ of the values of the batch.
+    """
+    output = mlp(actor, observation)
     first = [layer[:1] for layer in critics]
-    return -q_values(first, observation, action, bounds).mean()
+    value = q_values(first, observation, bounds.from_unit(output.tanh()), bounds)
+    loss = -value.mean()
+    if saturation_cost:
+        beyond = (output.abs() - SATURATED).clamp_min(0.0)
+        loss = loss + saturation_cost * value.detach().std() * beyond.square().mean()
+    return loss
 
 
 ADAM_BETAS = (0.9, 0.999)

@@ -58,6 +58,9 @@ class TD3Config:
         value_expansion: number of rewards in the value target; the first is that of the transition,
             the others come from the model (Acrobot needs 5). Or their duration, such as
             "0.2 s".
+        saturation_cost: price of saturated actions in the actor's loss: of the square of outputs
+            beyond 2 before their tanh, in standard deviations of the values of a batch. It keeps an
+            actor learning that has met no reward so far; 0 for none.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.
@@ -81,6 +84,7 @@ such as '5 s', got 1.5.
     target_noise: float = 0.1
     target_noise_clip: float = 0.5
     value_expansion: Steps = 1
+    saturation_cost: float = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -90,7 +94,9 @@ such as '5 s', got 1.5.
         check_steps(self, "value_expansion")
         check_discount(self, "gamma")
         check_positive_share(self, "tau")
-        check_not_negative(self, "target_noise", "target_noise_clip", "last_layer_scale")
+        check_not_negative(
+            self, "target_noise", "target_noise_clip", "last_layer_scale", "saturation_cost"
+        )
 
 
 def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
@@ -247,7 +253,7 @@ class TD3Update(ActorCriticUpdate):
             rates = (rate[i] for rate in critic_rates)
             adam_(nets.critics, gradients, nets.critic_means, nets.critic_squares, *rates)
         gradients, loss_actor = grad_and_value(
-            actor_loss, nets.actor, nets.critics, observation, bounds
+            actor_loss, nets.actor, nets.critics, observation, bounds, config.saturation_cost
         )
         adam_(nets.actor, gradients, nets.actor_means, nets.actor_squares, *actor_rates)
         soft_update_(nets.target_actor, nets.actor, config.tau)

@@ -17,6 +17,7 @@ AS_SET = "as-set"
 # other swing-ups of 10 to 30 s is found, whatever their time steps.
 _CONSTANT, _LIFE, _EXPANSION = 0.4, 0.6, 0.01
 _MOST_EXPANDED, _LEAST_EXPANDED = 5, 3
+_SATURATION = 0.1  # its price
 _WORLDS = 4  # times the imagined worlds
 _GROWTH = 0.6  # share of the updates within which starts reach the coverage box
 
@@ -46,7 +47,9 @@ def look_further(config: PolicyConfig, task: Task) -> PolicyConfig:
 
     The time constant of the discount becomes 0.4 of an episode's duration and lives last 0.6 of it,
     unless they are set; the expansion is a hundredth of it, but 3 to 5 steps, as its time grows
-    with them. A discount or an expansion that reaches further already is kept.
+    with them. A discount or an expansion that reaches further already is kept. Saturated actions
+    have a price: an actor that meets no reward for long ends at its bounds everywhere, and would
+    stay there, for tanh has no slope, when at last it meets one.
 
     Args:
         config: settings of the phase.
@@ -65,6 +68,7 @@ def look_further(config: PolicyConfig, task: Task) -> PolicyConfig:
         config.td3,
         gamma=max(config.td3.gamma, gamma),
         value_expansion=max(config.td3.value_expansion, expansion),
+        saturation_cost=max(config.td3.saturation_cost, _SATURATION),
     )
     return replace(config, td3=td3, max_age=config.max_age or max(1, round(_LIFE * steps)))
 

@@ -187,6 +187,27 @@ def test_losses_by_hand():
     assert loss.item() == pytest.approx(expected)
 
 
+def test_saturated_actors_pay_and_come_back():
+    observation = observe(torch.tensor([[0.0, 1.0], [0.0, -5.0]]))
+    actor = [FLAT_ACTOR[0], torch.full_like(FLAT_ACTOR[1], 30.0)]
+    free, slope = _loss_and_slope(actor, observation, 0.0)
+    assert slope == 0.0, "the slope of tanh is none out there"
+    priced, slope = _loss_and_slope(actor, observation, 0.1)
+    # Q1 = (13, 7) at the bound.
+    assert priced - free == pytest.approx(0.1 * math.sqrt(18.0) * 28.0**2)
+    assert slope == pytest.approx(0.1 * math.sqrt(18.0) * 2 * 28.0)
+    near = [FLAT_ACTOR[0], torch.full_like(FLAT_ACTOR[1], 1.9)]
+    assert _loss_and_slope(near, observation, 0.1) == _loss_and_slope(near, observation, 0.0)
+
+
+def _loss_and_slope(actor, observation, price):
+    weight, bias = actor
+    bias = bias.clone().requires_grad_()
+    loss = actor_loss([weight, bias], FLAT_CRITICS, observation, BOUNDS, price)
+    loss.backward()
+    return loss.item(), bias.grad.item()
+
+
 @pytest.mark.parametrize("rate", [1e-1, 1e-3])
 def test_adam_is_torchs(rate):
     params = [torch.randn(4, 3), torch.randn(4)]
