@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 from torch import nn
 
 from phihp_torchrl.deployment import Agent
+from phihp_torchrl.dynamics import PreparedModel
 from phihp_torchrl.planners import SearchConfig
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 
-# What a call of the model costs beside its transitions, in transitions.
+# What a call of the model costs beside its transitions, in transitions of a model whose step has at
+# most so many tensor operations. Others cost more in proportion.
 _CALL = 1000
+_OPERATIONS = 60
 # Weights of a network that take as long as a transition of the model.
 _WEIGHTS = 10_000
 # Episodes that each way plays in any case: below them a standard error says little.
@@ -26,6 +30,7 @@ class Price:
         planner: settings of the planner, with horizons in steps.
         actor: of one action of the actor.
         critics: of one value.
+        step: of one step of the model.
 
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig
@@ -37,12 +42,14 @@ class Price:
     planner: SearchConfig
     actor: float = 0.0
     critics: float = 0.0
+    step: float = 1.0
 
     @classmethod
     def of(cls, agent: Agent) -> Price:
-        """The price of the plans of an agent, by the size of its networks."""
+        """The price of the plans of an agent, by the size of its networks and of its model."""
         assert agent.planner_config is not None
-        return cls(agent.planner_config, _network(agent.actor), _network(agent.qvalue))
+        networks = _network(agent.actor), _network(agent.qvalue)
+        return cls(agent.planner_config, *networks, _step(agent))
 
     def plan(self, rows: int) -> float:
         """Of a plan for ``rows`` episodes at once, for each step of them."""
@@ -52,7 +59,7 @@ class Price:
         calls = planner.optim_steps * steps
         networks = planner.num_policy_candidates * steps * self.actor
         networks += planner.optim_steps * planner.num_candidates * self.critics
-        total = calls * (_CALL + rows * planner.num_candidates) + rows * networks
+        total = calls * self.step * (_CALL + rows * planner.num_candidates) + rows * networks
         return total / getattr(planner, "replan_every", 1)
 
 
@@ -75,6 +82,15 @@ def first_episodes(config: CalibrateConfig, price: Price, steps: float, ways: in
         if ways * steps * price.plan(episodes) <= config.budget:
             return episodes
     return min(_LEAST, config.episodes)
+
+
+def _step(agent: Agent) -> float:
+    """Transitions of a small model that take as long as one of the agent's, uncompiled."""
+    assert agent.dynamics is not None
+    dynamics = copy.deepcopy(agent.dynamics)  # without the compiled step, if it has one
+    like = next(agent.parameters())
+    operations = PreparedModel(agent.task, dynamics, like).operations
+    return max(1.0, operations / _OPERATIONS)
 
 
 def _network(module: nn.Module | None) -> float:

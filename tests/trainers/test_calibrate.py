@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, load_config, save_agent
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.integrators import make_integrator
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
 from phihp_torchrl.trainers import (
     CalibrateConfig,
@@ -264,6 +265,23 @@ def test_larger_networks_make_plans_dearer():
     assert narrow.critics == 0.0  # it has none
     assert narrow.actor > 1.0
     assert narrow.plan(6) > Price(SMALL).plan(6)
+
+
+def test_more_steps_of_the_solver_make_plans_dearer():
+    agent = make_agent()
+    assert Price.of(agent).step == 1.0, "small models are alike"
+    solver = make_integrator("rk4", substeps=4)
+    dear = Agent(
+        agent.task,
+        dynamics=HybridDynamics.hybrid(agent.task, integrator=solver),
+        actor=agent.actor,
+        planner_config=agent.planner_config,
+    )
+    eager = Price.of(dear)
+    assert eager.step > 3.0
+    assert eager.plan(6) > 3.0 * Price.of(agent).plan(6)
+    dear.dynamics.compile_step()
+    assert Price.of(dear) == eager, "the compiler changes no number of episodes"
 
 
 # The agent that is shipped.
