@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any
 
 from other_worlds import WORLDS
-from phihp_torchrl import load_config, make_world, run
+from phihp_torchrl import load_config, run
 from phihp_torchrl.config import kind_mapping
 from phihp_torchrl.tasks import list_tasks, register_task
 from phihp_torchrl.trainers import RunDirectory, read_run_config
-from phihp_torchrl.worlds import GivenConfig
+from phihp_torchrl.worlds import EnvWorld, GivenConfig
 from world_scores import write_report
 
 RESULTS, RUNS = Path("results/worlds"), Path("outputs/worlds")
@@ -80,7 +80,7 @@ def train(name: str, seed: int, path: Path, changes: Sequence[str] = ()) -> dict
     loaded = load_config(world.task.name, overrides=lines)
     config = read_run_config({**loaded, "world": kind_mapping(GivenConfig())})
     begun = RunDirectory(path).config.is_file()
-    made = run(config, path, resume=begun, world=make_world(world.task, world.make_env))
+    made = run(config, path, resume=begun, world=EnvWorld(world.task, world.make_env, copies=True))
     return result(name, seed, lines, made.path) if made.finished else None
 
 

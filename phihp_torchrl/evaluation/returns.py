@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, SerialEnv
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment import plain_defaults
@@ -25,6 +25,7 @@ from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld, World
 
 _log = logging.getLogger(__name__)
+_AT_ONCE = 64  # environments of a world at most
 DOING = "playing episodes"
 """What a run says that it is doing while this is on its stack."""
 
@@ -110,9 +111,10 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a policy: play episodes in a world and return their undiscounted returns.
 
-    In a simulated world all episodes are played at once as a batch, in other worlds one after the
-    other. Two policies that are evaluated with the same seed start from the same states. Global
-    random states are restored.
+    In a simulated world all episodes are played at once as a batch; so are up to 64 in a world of
+    which there may be several (:attr:`~phihp_torchrl.worlds.World.copies`); in other worlds they
+    are played one after the other. Two policies that are evaluated with the same seed start from
+    the same states. Global random states are restored.
 
     Args:
         policy: a module that reads ``"observation"`` and writes ``"action"``, called with all
@@ -145,7 +147,7 @@ def evaluate(
     if env is None:
         world = SimulatedWorld(task) if world is None else world
         model = world.model()
-        env = world.make_env() if model is None else None
+        env = _make_env(world, episodes) if model is None else None
     if env is not None and len(env.batch_size) > 1:
         raise ConfigError("env", f"expected batch size [] or [n], got {list(env.batch_size)}.")
     device = torch.device(device or "cpu") if env is None else (env.device or torch.device("cpu"))
@@ -167,6 +169,12 @@ def evaluate(
     violations = {name: Violations(*each) for name, *each in found} or None
     own = returns, lengths, terminated, seconds, chatter, violations
     return Evaluation(task.name, seed, *own, first)
+
+
+def _make_env(world: World, episodes: int) -> EnvBase:
+    """An environment of the world, or a batch of them where each is a world of its own."""
+    count = min(episodes, _AT_ONCE)
+    return SerialEnv(count, world.make_env) if world.copies and count > 1 else world.make_env()
 
 
 def _play_model(

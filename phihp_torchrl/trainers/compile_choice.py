@@ -169,7 +169,8 @@ def _calibrate_steps(config: RunConfig, settings: Any, world: World) -> float:
 
 def _evaluate_steps(config: RunConfig, settings: Any, world: World) -> float:
     """Calls of the model by plans: of all episodes at once, or of one after the other."""
-    alone = 1 if world.truth is not None else settings.episodes * world.has_env
+    at_once = world.truth is not None or world.copies
+    alone = 1 if at_once else settings.episodes * world.has_env
     return (alone * world.task.max_steps + settings.latency_actions) * _plan_steps(config)
 
 
@@ -197,7 +198,7 @@ def _tdmpc(config: RunConfig, settings: Any, world: World) -> Earned:
 
 def _evaluate(config: RunConfig, settings: Any, world: World) -> Earned:
     # Where the episodes are a batch, a plan is nearly all arithmetic, and is never compiled.
-    if config.planner is None or world.truth is not None or not world.has_env:
+    if config.planner is None or world.truth is not None or world.copies or not world.has_env:
         return Earned(0.0, 0.0)
     plans = settings.episodes * world.task.max_steps + settings.latency_actions
     steps = _plan_steps(config)

@@ -187,7 +187,7 @@ class EvaluatePhase:
     def _evaluate(self, name: str, agent: Agent) -> dict[str, float]:
         settings, task = self.settings, self.agent.task
         played = evaluate(
-            _eager(agent) if self.world.truth is not None else agent,
+            _eager(agent) if self.world.truth is not None or self.world.copies else agent,
             task,
             episodes=settings.episodes,
             seed=settings.first_seed,
@@ -272,7 +272,7 @@ def _eager(agent: Agent) -> Agent:
 
     A plan for all episodes at once is nearly all arithmetic: its graph would take as long to
     compile as the episodes take, and save little. Only single plans are compiled, of which the time
-    is measured, and in worlds that are played one episode after the other.
+    is measured, and in worlds of which there is one, which is played episode after episode.
     """
     if agent.planner is None or type(agent) is not Agent:  # another sort may plan otherwise
         return agent

@@ -44,6 +44,10 @@ class World(ABC):
     has_env: ClassVar[bool] = True
     """Whether one can act in it; a world without an environment has :attr:`recordings`."""
 
+    copies: bool = False
+    """Whether every environment of :meth:`make_env` is a world of its own, as simulators are and a
+    rig is not. Then evaluation plays several episodes at once."""
+
     def __init__(self, task: Task) -> None:
         self.task = task
 

@@ -26,6 +26,8 @@ class GymnasiumConfig:
     Args:
         id: gymnasium id, e.g. Pendulum-v1; module:id imports the module that registers it.
         options: keyword arguments of gymnasium.make.
+        copies: whether each environment is a world of its own, as simulators are, so that several
+            episodes can be evaluated at once; set it to false for a rig.
 
     Examples:
         >>> from phihp_torchrl import make_world
@@ -37,6 +39,7 @@ class GymnasiumConfig:
 
     id: str
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    copies: bool = True
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -68,7 +71,8 @@ class GymnasiumWorld(EnvWorld):
     kind = GymnasiumConfig.kind
 
     def __init__(self, task: Task, config: GymnasiumConfig) -> None:
-        super().__init__(task, self._wrap, label=f"gymnasium {config.id}")
+        label = f"gymnasium {config.id}"
+        super().__init__(task, self._wrap, label=label, copies=config.copies)
         self.config = config
 
     def make_env(self, *, render: bool = False) -> EnvBase:

@@ -35,6 +35,8 @@ class TorchRLConfig:
     Args:
         make: the function, as module:function; modules in the working directory are found too.
         options: keyword arguments of the function.
+        copies: whether each call makes a world of its own, as of a simulator, so that several
+            episodes can be evaluated at once; false for a rig.
 
     Raises:
         ConfigError: if ``make`` is not of the form module:function.
@@ -50,6 +52,7 @@ class TorchRLConfig:
 
     make: str
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    copies: bool = False
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -71,6 +74,8 @@ class EnvWorld(World):
         make: a function that makes an environment of TorchRL or gymnasium, called once for each
             phase that acts in the world; or one TorchRL environment, which all phases use.
         label: name of the world in messages.
+        copies: whether each call of the function makes a world of its own, as of a simulator.
+            Then evaluation calls it for many episodes, and plays them at once.
 
     Raises:
         ConfigError: when an environment is made, before any step, if it does not fit the task.
@@ -89,17 +94,24 @@ class EnvWorld(World):
     kind = "torchrl"
 
     def __init__(
-        self, task: Task, make: Callable[[], Any] | EnvBase, *, label: str = "torchrl"
+        self,
+        task: Task,
+        make: Callable[[], Any] | EnvBase,
+        *,
+        label: str = "torchrl",
+        copies: bool = False,
     ) -> None:
         super().__init__(task)
-        self._make = (lambda: make) if isinstance(make, EnvBase) else make
-        self.label = label
+        single = isinstance(make, EnvBase)
+        self._make = (lambda: make) if single else make
+        self.label, self.copies = label, copies and not single
 
     @classmethod
     def from_config(cls, task: Task, config: TorchRLConfig) -> EnvWorld:
         """Make the world whose environments the function ``config.make`` makes."""
         function = import_object("world.make", config.make)
-        return cls(task, lambda: function(**config.options), label=f"torchrl {config.make}")
+        label = f"torchrl {config.make}"
+        return cls(task, lambda: function(**config.options), label=label, copies=config.copies)
 
     def make_env(self, *, render: bool = False) -> EnvBase:
         env = self._make()

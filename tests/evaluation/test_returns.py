@@ -22,6 +22,7 @@ from phihp_torchrl.evaluation import measure_latency, play_episode
 from phihp_torchrl.tasks import list_tasks
 from phihp_torchrl.worlds import (
     EnvWorld,
+    GuardedWorld,
     GymnasiumConfig,
     GymnasiumWorld,
     SimulatedConfig,
@@ -141,9 +142,10 @@ def test_a_world_of_other_constants_is_another_world():
     torch.testing.assert_close(there.returns, slow.returns, rtol=1e-4, atol=1e-4)
 
 
-def test_a_world_that_is_not_simulated_plays_one_episode_after_another():
+@pytest.mark.parametrize("copies", [True, False])
+def test_a_world_that_is_not_simulated_plays_episodes_from_its_seed(copies):
     task = replace(get_task("pendulum"), max_steps=25)
-    world = GymnasiumWorld(task, GymnasiumConfig("Pendulum-v1"))
+    world = GymnasiumWorld(task, GymnasiumConfig("Pendulum-v1", copies=copies))
     result = evaluate(constant(1.5), task, episodes=3, seed=4, world=world)
     assert result.lengths.tolist() == [25] * 3
     assert not result.terminated.any()
@@ -155,6 +157,25 @@ def test_a_world_that_is_not_simulated_plays_one_episode_after_another():
     # An episode played to be looked at is the first of them.
     episode = play_episode(constant(1.5), task, seed=4, world=world)
     assert episode.total_reward == pytest.approx(result.returns[0].item(), rel=1e-5)
+
+
+@pytest.mark.parametrize(("copies", "guarded"), [(True, False), (True, True), (False, False)])
+def test_episodes_are_played_at_once_where_each_environment_is_a_world(copies, guarded):
+    task = replace(get_task("cartpole"), max_steps=120)
+    world = EnvWorld(task, SimulatedWorld(task).make_env, copies=copies)
+    policy = Noisy()
+    played = GuardedWorld(world, {"x": 2.0}) if guarded else world
+    result = evaluate(policy, task, episodes=4, seed=0, world=played)
+    assert policy.starts[0].shape == ((4, 1) if copies else (1,))
+    assert result.lengths.shape == (4,)
+    assert torch.equal(result.returns, result.lengths.to(torch.float64))
+    assert len(set(result.lengths.tolist())) > 1, "each starts elsewhere"
+
+
+def test_one_environment_has_no_copies():
+    task = get_task("pendulum")
+    world = EnvWorld(task, SimulatedWorld(task).make_env(), copies=True)
+    assert not world.copies
 
 
 def test_an_environment_may_be_a_world():

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -15,6 +13,7 @@ from phihp_torchrl import HybridDynamics, load_config, make_world
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.trainers import compile_choice, read_run_config, run
 from phihp_torchrl.trainers.compile_choice import Earned, earned, earned_by_step
+from phihp_torchrl.worlds import EnvWorld
 
 from .run_parts import CONFIG
 
@@ -57,8 +56,10 @@ def test_a_phase_that_compiles_nothing_or_is_unknown_earns_nothing(name):
 
 def test_episodes_of_a_batch_are_no_reason_to_compile_plans():
     assert found("evaluate") == Earned(0.0, 0.0)
-    alone: Any = SimpleNamespace(truth=None, has_env=True, task=WORLD.task)
+    alone = EnvWorld(WORLD.task, WORLD.make_env)
     assert found("evaluate", world=alone).pays
+    several = EnvWorld(WORLD.task, WORLD.make_env, copies=True)
+    assert found("evaluate", world=several) == Earned(0.0, 0.0)
     assert not found("evaluate", world=alone, episodes=1, latency_actions=0).pays
 
 
@@ -93,12 +94,14 @@ def test_a_phase_with_graphs_of_its_own_calls_no_step():
 
 
 def test_plans_that_call_a_compiled_step_have_no_graph_of_their_own():
-    alone: Any = SimpleNamespace(truth=None, has_env=True, task=WORLD.task)
+    alone = EnvWorld(WORLD.task, WORLD.make_env)
+    several = EnvWorld(WORLD.task, WORLD.make_env, copies=True)
     config = read_run_config(load_config("pendulum-swingup"))
     section = config.section("evaluate")
     assert earned(config, "evaluate", section, alone).pays
     assert earned(config, "evaluate", section, alone, step=True) == Earned(0.0, 0.0)
     assert by_step(600, ("evaluate",), alone).saved > by_step(600, ("evaluate",)).saved > 0.0
+    assert by_step(600, ("evaluate",), several) == by_step(600, ("evaluate",))
 
 
 def test_a_run_compiles_the_step_that_it_has_chosen(tmp_path: Path, capfd, monkeypatch) -> None:
