@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from phihp_torchrl.imagination import Rollouts
+from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.trainers.learners import Imagination, register_learner
+from phihp_torchrl.trainers.planned_acts import PlannedActs
 from phihp_torchrl.trainers.td3_base import TD3Trainer
 
 DOING = "training in imagination"
@@ -25,6 +28,7 @@ class ImaginedTD3(TD3Trainer):
         super().__init__(
             imagination.world_model, config.td3, seed=imagination.seed, compile=imagination.compile
         )
+        self.planned = self._planned(imagination)
         self.replay = imagination.new_replay()
         self.enter(imagination.new_worlds(self.generator))
 
@@ -53,12 +57,26 @@ class ImaginedTD3(TD3Trainer):
         batch = self.replay.sample(count, self.generator)
         return batch.state, batch.action
 
+    def _planned(self, imagination: Imagination) -> Rollouts:
+        """The same rollouts, in some of whose worlds plans act; they are not compiled."""
+        worlds, rollouts = self.config.planned_worlds, self.rollouts
+        if not worlds:
+            return rollouts
+        acts = PlannedActs(
+            imagination.planning_model,
+            self.update.networks,
+            CEMConfig(gamma=self.config.td3.gamma),
+            worlds=worlds,
+            generator=self.generator,
+        )
+        return Rollouts(imagination.world_model, acts, rollouts.max_age)
+
     def _imagine_chunk(self) -> None:
         config = self.config
         while True:
             warm = len(self.replay) >= config.random_steps
             self._act(
-                self.rollouts,
+                self.planned if warm else self.rollouts,
                 self.start_states.sample([config.chunk_steps, config.num_worlds], self.generator),
                 noise=config.exploration_noise,
                 random_fraction=config.random_fraction if warm else 1.0,

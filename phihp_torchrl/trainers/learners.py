@@ -73,6 +73,8 @@ class Imagination:
         seed: seed of all random numbers but the initial weights of the networks.
         compile: whether to compile updates.
         schedule: the factor on learning rates, by the updates so far; it may fall early.
+        planning_model: the model by which plans are made, in the same units: the mean one where
+            every imagined world has a model of its own.
     """
 
     world_model: TaskWorldModel
@@ -82,6 +84,7 @@ class Imagination:
     seed: int
     compile: bool
     schedule: Schedule
+    planning_model: TaskWorldModel
 
     def new_replay(self) -> FlatReplay:
         """An empty replay of the size that the settings say."""

@@ -131,6 +131,7 @@ class PolicyTrainer:
                 seed,
                 compile,
                 self.schedule,
+                scaled(TaskWorldModel(task, dynamics), self.scales),
             )
         )
         self.best = [layer.clone() for layer in self._layers()]

@@ -18,6 +18,7 @@ AS_SET = "as-set"
 _CONSTANT, _LIFE, _EXPANSION = 0.4, 0.6, 0.01
 _MOST_EXPANDED, _LEAST_EXPANDED = 5, 3
 _SATURATION = 0.1  # its price
+_PLANNED = 16  # worlds
 _WORLDS = 4  # times the imagined worlds
 _GROWTH = 0.6  # share of the updates within which starts reach the coverage box
 
@@ -49,7 +50,8 @@ def look_further(config: PolicyConfig, task: Task) -> PolicyConfig:
     unless they are set; the expansion is a hundredth of it, but 3 to 5 steps, as its time grows
     with them. A discount or an expansion that reaches further already is kept. Saturated actions
     have a price: an actor that meets no reward for long ends at its bounds everywhere, and would
-    stay there, for tanh has no slope, when at last it meets one.
+    stay there, for tanh has no slope, when at last it meets one. And in some of the imagined worlds
+    plans act, which meet rewards sooner.
 
     Args:
         config: settings of the phase.
@@ -70,7 +72,11 @@ def look_further(config: PolicyConfig, task: Task) -> PolicyConfig:
         value_expansion=max(config.td3.value_expansion, expansion),
         saturation_cost=max(config.td3.saturation_cost, _SATURATION),
     )
-    return replace(config, td3=td3, max_age=config.max_age or max(1, round(_LIFE * steps)))
+    planned = config.planned_worlds
+    if config.method == "td3":
+        planned = max(planned, min(_PLANNED, config.num_worlds // 4))
+    life = config.max_age or max(1, round(_LIFE * steps))
+    return replace(config, td3=td3, max_age=life, planned_worlds=planned)
 
 
 def start_wider(config: PolicyConfig, task: Task) -> PolicyConfig:
@@ -162,7 +168,7 @@ def learn_by_gradients(config: PolicyConfig, task: Task) -> PolicyConfig:
     # One actor update has this many of the critics, which has to divide all three.
     count = math.gcd(analytic.critic_updates, config.updates, config.evaluation_interval, together)
     analytic = replace(analytic, critic_updates=count)
-    return replace(further, method="analytic", analytic=analytic)
+    return replace(further, method="analytic", planned_worlds=0, analytic=analytic)
 
 
 STRATEGIES: Registry[Strategy] = Registry("policy.strategies")
