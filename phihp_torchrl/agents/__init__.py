@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from phihp_torchrl.agents.analytic_config import AnalyticConfig
 from phihp_torchrl.agents.analytic_update import AnalyticUpdate, Draws
-from phihp_torchrl.agents.equations import Layers, act, q_values, soft_update_
+from phihp_torchrl.agents.equations import Layers, act, prepare, q_values, soft_update_
 from phihp_torchrl.agents.networks import (
     Actor,
     QNetwork,
@@ -19,7 +19,7 @@ from phihp_torchrl.agents.refit import CriticRefit, Refit, RefitConfig
 from phihp_torchrl.agents.replay import FlatReplay
 from phihp_torchrl.agents.scales import Scales, measure_scales, scaled, visited_states
 from phihp_torchrl.agents.td3 import TD3Config, TD3Update, make_td3_loss
-from phihp_torchrl.agents.update import ActorCriticUpdate, learning_rate_scale
+from phihp_torchrl.agents.update import ActorCriticUpdate, Networks, learning_rate_scale
 
 __all__ = [
     "Actor",

@@ -5,9 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from phihp_torchrl.agents import Layers, act
-from phihp_torchrl.agents.equations import prepare
-from phihp_torchrl.agents.update import Networks
+from phihp_torchrl.agents import Layers, Networks, act, prepare
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.planners import CEMConfig, Problem, cem_plan
 from phihp_torchrl.tasks import ActionBounds
