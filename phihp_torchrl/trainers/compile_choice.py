@@ -14,6 +14,7 @@ from typing import Any
 
 from phihp_torchrl.config import resolve_seconds
 from phihp_torchrl.display import duration
+from phihp_torchrl.trainers.planned_acts import PLANNED, SEARCH
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.worlds import World
 
@@ -157,7 +158,8 @@ def _policy_steps(config: RunConfig, settings: Any, world: World) -> float:
     played = settings.evaluation_steps or world.task.max_steps
     calls = (1 + updates / settings.evaluation_interval) * played
     if settings.method == "td3":
-        calls += updates / settings.updates_per_step
+        planned = PLANNED * SEARCH.planning_horizon * SEARCH.optim_steps
+        calls += updates / settings.updates_per_step * (1 + (settings.planned > 0) * planned)
     if refit.interval:
         calls += (1 + max(0.0, updates - refit.start) / refit.interval) * refit.horizon
     return calls

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from torch import Tensor
 
 from phihp_torchrl.imagination import Rollouts
-from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.trainers.learners import Imagination, register_learner
-from phihp_torchrl.trainers.planned_acts import PlannedActs
+from phihp_torchrl.trainers.planned_acts import SEARCH, PlannedActs, planned_share
 from phihp_torchrl.trainers.td3_base import TD3Trainer
 
 DOING = "training in imagination"
@@ -28,7 +29,14 @@ class ImaginedTD3(TD3Trainer):
         super().__init__(
             imagination.world_model, config.td3, seed=imagination.seed, compile=imagination.compile
         )
-        self.planned = self._planned(imagination)
+        self.acts = PlannedActs(
+            imagination.planning_model,
+            self.update.networks,
+            replace(SEARCH, gamma=config.td3.gamma),
+            worlds=0,
+            generator=self.generator,
+        )
+        self.planned = Rollouts(imagination.world_model, self.acts, self.rollouts.max_age)
         self.replay = imagination.new_replay()
         self.enter(imagination.new_worlds(self.generator))
 
@@ -57,26 +65,19 @@ class ImaginedTD3(TD3Trainer):
         batch = self.replay.sample(count, self.generator)
         return batch.state, batch.action
 
-    def _planned(self, imagination: Imagination) -> Rollouts:
-        """The same rollouts, in some of whose worlds plans act; they are not compiled."""
-        worlds, rollouts = self.config.planned_worlds, self.rollouts
-        if not worlds:
-            return rollouts
-        acts = PlannedActs(
-            imagination.planning_model,
-            self.update.networks,
-            CEMConfig(gamma=self.config.td3.gamma),
-            worlds=worlds,
-            generator=self.generator,
-        )
-        return Rollouts(imagination.world_model, acts, rollouts.max_age)
+    def _planned_worlds(self) -> int:
+        """The number of worlds in which plans act now."""
+        config = self.config
+        left = planned_share(self.updates / config.updates)
+        return round(left * config.planned * config.num_worlds)
 
     def _imagine_chunk(self) -> None:
         config = self.config
         while True:
             warm = len(self.replay) >= config.random_steps
+            self.acts.worlds = self._planned_worlds() if warm else 0
             self._act(
-                self.planned if warm else self.rollouts,
+                self.planned if self.acts.worlds else self.rollouts,
                 self.start_states.sample([config.chunk_steps, config.num_worlds], self.generator),
                 noise=config.exploration_noise,
                 random_fraction=config.random_fraction if warm else 1.0,

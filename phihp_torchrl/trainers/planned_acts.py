@@ -10,6 +10,24 @@ from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.planners import CEMConfig, Problem, cem_plan
 from phihp_torchrl.tasks import ActionBounds
 
+SEARCH = CEMConfig()
+"""The search of these plans, the default planner's; it has the discount of the critics."""
+_FALL, _END = 0.25, 0.5
+PLANNED = (_FALL + _END) / 2
+"""The share of the updates with plans, each counted by the share of plans that is left."""
+
+
+def planned_share(done: float) -> float:
+    """The share of plans that is left after so much of the updates.
+
+    Plans find rewards early, and the actor's last gains are in what it meets itself.
+
+    Examples:
+        >>> [planned_share(done) for done in (0.1, 0.25, 0.375, 0.5, 0.9)]
+        [1.0, 1.0, 0.5, 0.0, 0.0]
+    """
+    return min(1.0, max(0.0, (_END - done) / (_END - _FALL)))
+
 
 class PlannedActs:
     """A policy of imagined worlds: plans act in the first of them, and the actor in the others.

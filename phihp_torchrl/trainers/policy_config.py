@@ -38,8 +38,9 @@ class PolicyConfig:
         updates: planned number of critic updates; patience and extension may change it.
         batch_size: transitions in an update.
         num_worlds: number of imagined worlds that are stepped at once.
-        planned_worlds: number of them, the first ones, in which plans act with the present actor
-            and critics, and meet what the actor does not find; with method td3 alone.
+        planned: share of them in which plans act, with the present actor and critics, and meet what
+            the actor does not find yet; it falls to 0 between a quarter and a half of the updates.
+            With method td3 alone.
         chunk_steps: steps of all worlds between two rounds of updates.
         updates_per_step: critic updates for each step of all worlds.
         replay_capacity: imagined transitions kept for replay.
@@ -90,7 +91,7 @@ class PolicyConfig:
     updates: int = 8000
     batch_size: int = 128
     num_worlds: int = 64
-    planned_worlds: int = 0
+    planned: float = 0.25
     chunk_steps: int = 4
     updates_per_step: int = 8
     replay_capacity: int = 200_000
@@ -136,25 +137,14 @@ class PolicyConfig:
         check_choice(self, "scales", ("auto", "none"))
         if isinstance(self.strategies, str):
             check_choice(self, "strategies", ("auto", "none"))
-        check_share(self, "random_fraction", "decay", "patience", "tail")
-        check_count(self, "random_steps", "real_evaluation_episodes", "planned_worlds", least=0)
+        check_share(self, "planned", "random_fraction", "decay", "patience", "tail")
+        check_count(self, "random_steps", "real_evaluation_episodes", least=0)
         check_not_negative(self, "exploration_noise", "extension")
         if self.random_steps > self.replay_capacity:
             raise ConfigError(
                 "random_steps",
                 f"expected at most replay_capacity = {self.replay_capacity}, "
                 f"got {self.random_steps}.",
-            )
-        if self.planned_worlds > self.num_worlds:
-            raise ConfigError(
-                "planned_worlds",
-                f"expected at most num_worlds = {self.num_worlds}, got {self.planned_worlds}.",
-            )
-        if self.planned_worlds and self.method == "analytic":
-            raise ConfigError(
-                "planned_worlds",
-                f"expected 0 with method=analytic, whose gradients go through the actor's own "
-                f"actions, got {self.planned_worlds}.",
             )
         if self.constants_std is not None and not self.draw_constants:
             raise ConfigError(

@@ -18,7 +18,6 @@ AS_SET = "as-set"
 _CONSTANT, _LIFE, _EXPANSION = 0.4, 0.6, 0.01
 _MOST_EXPANDED, _LEAST_EXPANDED = 5, 3
 _SATURATION = 0.1  # its price
-_PLANNED = 16  # worlds
 _WORLDS = 4  # times the imagined worlds
 _GROWTH = 0.6  # share of the updates within which starts reach the coverage box
 
@@ -50,8 +49,7 @@ def look_further(config: PolicyConfig, task: Task) -> PolicyConfig:
     unless they are set; the expansion is a hundredth of it, but 3 to 5 steps, as its time grows
     with them. A discount or an expansion that reaches further already is kept. Saturated actions
     have a price: an actor that meets no reward for long ends at its bounds everywhere, and would
-    stay there, for tanh has no slope, when at last it meets one. And in some of the imagined worlds
-    plans act, which meet rewards sooner.
+    stay there, for tanh has no slope, when at last it meets one.
 
     Args:
         config: settings of the phase.
@@ -72,11 +70,7 @@ def look_further(config: PolicyConfig, task: Task) -> PolicyConfig:
         value_expansion=max(config.td3.value_expansion, expansion),
         saturation_cost=max(config.td3.saturation_cost, _SATURATION),
     )
-    planned = config.planned_worlds
-    if config.method == "td3":
-        planned = max(planned, min(_PLANNED, config.num_worlds // 4))
-    life = config.max_age or max(1, round(_LIFE * steps))
-    return replace(config, td3=td3, max_age=life, planned_worlds=planned)
+    return replace(config, td3=td3, max_age=config.max_age or max(1, round(_LIFE * steps)))
 
 
 def start_wider(config: PolicyConfig, task: Task) -> PolicyConfig:
@@ -102,8 +96,9 @@ def start_at_goal(config: PolicyConfig, task: Task) -> PolicyConfig:
 
     That is the task's goal box, or else the states of its coverage box that earn most at once, and
     those around them (:func:`~phihp_torchrl.imagination.rewarding_states`). There are four times
-    as many imagined worlds, for such lives differ, and the critics are fitted at the end alone: to
-    go on from the best actor so far, again and again, would hold up what returns show last.
+    as many imagined worlds, for such lives differ, but plans in no more of them. The critics are
+    fitted at the end alone: to go on from the best actor so far, again and again, would hold up
+    what returns show last.
 
     Args:
         config: settings of the phase.
@@ -126,6 +121,7 @@ def start_at_goal(config: PolicyConfig, task: Task) -> PolicyConfig:
         look_further(config, task),
         start=replace(start, **{kind: 0.6}),
         num_worlds=_WORLDS * config.num_worlds,
+        planned=config.planned / _WORLDS,
         refit=refit,
     )
 
@@ -168,7 +164,7 @@ def learn_by_gradients(config: PolicyConfig, task: Task) -> PolicyConfig:
     # One actor update has this many of the critics, which has to divide all three.
     count = math.gcd(analytic.critic_updates, config.updates, config.evaluation_interval, together)
     analytic = replace(analytic, critic_updates=count)
-    return replace(further, method="analytic", planned_worlds=0, analytic=analytic)
+    return replace(further, method="analytic", analytic=analytic)
 
 
 STRATEGIES: Registry[Strategy] = Registry("policy.strategies")

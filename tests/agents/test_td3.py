@@ -190,7 +190,7 @@ def test_a_step_is_one_graph():
 @pytest.mark.slow
 def test_compiled_by_inductor_equals_eager():
     # Wide enough for oneDNN, which sums in another order.
-    wide = replace(SMALL, actor_hidden_sizes=(96, 96), critic_hidden_sizes=(96, 96))
+    wide = replace(SMALL, actor_hidden_sizes=(96,), critic_hidden_sizes=(96,))
     update = make_update(wide, compile=True)
     eager = make_update(wide)
     eager.load_state_dict(copy.deepcopy(update.state_dict()))

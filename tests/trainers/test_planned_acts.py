@@ -19,7 +19,7 @@ from phihp_torchrl.trainers.strategies import STRATEGIES
 
 from .trainer_parts import PENDULUM, POLICY, assert_same_state, policy_trainer
 
-PLANNED = replace(POLICY, planned_worlds=3)
+ALONE, PLANNED = replace(POLICY, planned=0.0), replace(POLICY, planned=0.75)
 SEARCH = CEMConfig(planning_horizon=8, num_candidates=32, alpha=0.0)
 
 
@@ -75,8 +75,11 @@ def test_warm_worlds_alone_are_planned(monkeypatch):
     trainer.advance()
     warm = trainer.learner.imagined_steps - POLICY.random_steps
     assert len(calls) * POLICY.num_worlds == warm > 0
+    trainer.advance()
     calls.clear()
-    policy_trainer().advance()
+    trainer.advance()
+    assert not calls, "plans have given way to the actor"
+    policy_trainer(ALONE).advance()
     assert not calls
 
 
@@ -104,21 +107,12 @@ def test_a_resumed_run_with_plans_is_the_same_run():
     assert_same_state(whole.state_dict(), resumed.state_dict(), but=["seconds"])
 
 
-def test_strategies_plan_in_a_quarter_of_the_worlds_at_most():
-    config = PolicyConfig(num_worlds=32)
-    assert STRATEGIES["further"].change(config, PENDULUM).planned_worlds == 8
-    assert STRATEGIES["goal"].change(config, PENDULUM).planned_worlds == 8
-    assert STRATEGIES["analytic"].change(config, PENDULUM).planned_worlds == 0
+def test_more_worlds_of_a_strategy_have_no_more_plans():
+    config = PolicyConfig()
+    changed = STRATEGIES["goal"].change(config, PENDULUM)
+    assert changed.planned * changed.num_worlds == config.planned * config.num_worlds == 16
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"planned_worlds": 65}, "at most num_worlds = 64, got 65"),
-        ({"planned_worlds": -1}, ">= 0, got -1"),
-        ({"planned_worlds": 4, "method": "analytic"}, "expected 0 with method=analytic"),
-    ],
-)
-def test_errors_name_the_key(changes, words):
-    with pytest.raises(ConfigError, match=f"^planned_worlds: .*{words}"):
-        PolicyConfig(**changes)
+def test_errors_name_the_key():
+    with pytest.raises(ConfigError, match=r"^planned: "):
+        PolicyConfig(planned=1.5)

@@ -189,7 +189,7 @@ def test_starts_where_the_reward_is_met_are_many_and_critics_wait_for_the_end(ex
 
 def test_strategies_keep_what_reaches_further_already() -> None:
     td3 = replace(TINY.td3, gamma=0.999, value_expansion=9, saturation_cost=0.2)
-    far = replace(TINY, td3=td3, max_age=7, planned_worlds=TINY.num_worlds)
+    far = replace(TINY, td3=td3, max_age=7)
     task = get_task("pendulum")
     changed = STRATEGIES["further"].change(far, task)
     assert changed == far  # so that it is not tried at all
