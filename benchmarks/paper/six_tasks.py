@@ -1,0 +1,141 @@
+r"""What a user of the defaults gets on the six tasks: returns, smoothness, and the time it takes.
+
+    python benchmarks/paper/run_grid.py method=phihp seed=101,102 \
+        task=pendulum,pendulum-swingup,cartpole,cartpole-swingup,acrobot,acrobot-swingup
+    python benchmarks/paper/six_tasks.py
+
+Reads the kept runs of default settings with training seeds from 100 on, in results/runs, and writes
+results/six_tasks/README.md. It runs nothing and chooses nothing. Means are over training seeds, and
+so are their intervals: episodes of one seed share their agent, so that a seed counts once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from measures import paired_difference_of_seeds
+from phihp_torchrl.evaluation import PUBLISHED, markdown_table
+from report.runs import Run, read_runs
+
+RUNS, RESULTS = Path("results/runs"), Path("results/six_tasks")
+TASKS = ("pendulum", "pendulum-swingup", "cartpole", "cartpole-swingup", "acrobot",
+         "acrobot-swingup")  # fmt: skip
+FIRST_SEED = 100
+AIMS = {
+    "pendulum": -183.6,
+    "pendulum-swingup": -345.9,
+    "cartpole": 500.0,
+    "cartpole-swingup": 420.7,
+    "acrobot": -91.3,
+    "acrobot-swingup": 404.6,
+}
+"""Mean returns of plans of version 0.1.0, which later defaults should not fall below."""
+
+
+def ours(runs: Sequence[Run], task: str) -> list[Run]:
+    """The default runs of a task with reporting seeds."""
+    kept = [run for run in runs if (run.method, run.label, run.task) == ("phihp", "default", task)]
+    return sorted((run for run in kept if run.seed >= FIRST_SEED), key=lambda run: run.seed)
+
+
+def player(run: Run, name: str) -> str:
+    """Who plays for ``name``: where calibration let the actor act, the agent is the actor."""
+    return name if name in run.acting else "actor"
+
+
+def chatter(run: Run, name: str) -> float:
+    """Mean change of the action in the second halves of the episodes, in half-ranges."""
+    evaluation = json.loads((run.folder / "evaluation.json").read_text())
+    return float(evaluation[player(run, name)].get("chatter", math.nan))
+
+
+def seconds_until(run: Run, level: float) -> float:
+    """Seconds of the run until its actor first earned ``level`` in the world; infinite if never.
+
+    The world's returns are logged with each evaluation and choose nothing.
+    """
+    reached = (p.seconds for p in run.curve if p.acting == "actor" and p.return_mean >= level)
+    return next(iter(reached), math.inf)
+
+
+def spread(values: Sequence[float], digits: int) -> str:
+    """A mean over seeds with the 95 % interval of Student's t, where there are two or more."""
+    found = paired_difference_of_seeds(values)
+    if found is None:
+        return "–"
+    if math.isnan(found.low):
+        return f"{found.mean:.{digits}f}"
+    return f"{found.mean:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
+
+
+def row(task: str, runs: Sequence[Run]) -> list[str]:
+    """The row of a task."""
+
+    def each(value: Callable[[Run], float]) -> list[float]:
+        return [value(run) for run in runs]
+
+    published = PUBLISHED.get(task, {}).get("PhIHP")
+    times = [] if published is None else each(lambda r: seconds_until(r, published.return_mean))
+    return [
+        task,
+        str(len(runs)),
+        f"{runs[0].samples:,}",
+        spread(each(lambda run: run.acting[player(run, "planner")].mean), 1),
+        f"{AIMS[task]:g}",
+        spread(each(lambda run: run.acting["actor"].mean), 1),
+        spread(each(lambda run: chatter(run, "planner")), 3),
+        spread(each(lambda run: chatter(run, "actor")), 3),
+        f"{sum(times) / len(times):.0f}" if times else "–",
+        f"{sum(each(lambda run: sum(run.seconds.values()))) / len(runs):.0f}",
+    ]
+
+
+def page(runs: Sequence[Run]) -> str:
+    """The results as a page."""
+    found = {task: ours(runs, task) for task in TASKS}
+    used = [run for those in found.values() for run in those]
+    header = ["task", "seeds", "real steps", "agent", "aim", "actor", "agent's chatter",
+              "actor's chatter", "s to published", "s in all"]  # fmt: skip
+    rows = [row(task, those) for task, those in found.items() if those]
+    missing = [task for task, those in found.items() if not those]
+    seeds = ", ".join(str(seed) for seed in sorted({run.seed for run in used}))
+    commits = ", ".join(sorted({run.commit for run in used}))
+    machines = "; ".join(sorted({run.machine for run in used}))
+    return (
+        "# The six tasks from defaults\n\n"
+        "Made by `python benchmarks/paper/six_tasks.py` from runs of `run_grid.py` in "
+        "`results/runs/`. Do not edit. *Agent* is what is saved: its plans, or its actor where "
+        "calibration in imagination found that no plan earns more. *Chatter* is the mean change of "
+        "the action from step to step in the second half of an episode, in half-ranges. *aim* is "
+        "the return of version 0.1.0. *s to published* are the seconds of a run, its real steps "
+        "and the fits of its model among them, until the actor first earned the published mean "
+        "return of PhIHP in ten episodes of the world; *s in all* has calibration and the "
+        "evaluation of 50 episodes too. Brackets are 95 % intervals over training seeds.\n\n"
+        f"{markdown_table(header, rows)}\n"
+        + (f"Not run yet: {', '.join(missing)}.\n\n" if missing else "")
+        + f"Training seeds {seeds}. Commits: {commits}. Machines: {machines}, shared with other "
+        "work, so that times are upper bounds.\n"
+    )
+
+
+def main() -> None:
+    """Read and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--runs", type=Path, default=RUNS)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    arguments = parser.parse_args()
+    runs = read_runs(arguments.runs, any_version=True).runs
+    if not any(ours(runs, task) for task in TASKS):
+        parser.exit(1, f"{arguments.runs}: expected default runs of seeds from {FIRST_SEED} on.\n")
+    arguments.results.mkdir(parents=True, exist_ok=True)
+    text = page(runs)
+    (arguments.results / "README.md").write_text(text)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""The table of the default on the six tasks: whose runs count, who plays, and how long it took."""
+
+from __future__ import annotations
+
+import json
+import math
+
+from kept_runs import make_run
+
+import six_tasks
+from report.runs import read_runs
+
+
+def test_reporting_seeds_of_the_default_alone_count(tmp_path):
+    for seed in (0, 99, 100, 103):
+        make_run(tmp_path, seed=seed)
+    make_run(tmp_path, seed=104, label="wide")
+    make_run(tmp_path, seed=105, method="td3-im-ph")
+    found = read_runs(tmp_path).runs
+    assert [run.seed for run in six_tasks.ours(found, "pendulum")] == [100, 103]
+    assert six_tasks.ours(found, "acrobot") == []
+
+
+def test_intervals_are_over_seeds(tmp_path):
+    for seed, mean in ((100, -180.0), (101, -190.0)):
+        make_run(tmp_path, seed=seed, acting={"actor": [mean] * 50})
+    cells = six_tasks.row("pendulum", read_runs(tmp_path).runs)
+    assert cells[1:4] == ["2", "1,000", "-185.0 [-248.5, -121.5]"]
+    assert cells[3] == cells[5], "where calibration let the actor act, the agent is the actor"
+    assert six_tasks.spread([1.0], 1) == "1.0"
+
+
+def test_chatter_is_that_of_who_plays(tmp_path):
+    folder = make_run(tmp_path, seed=100)
+    evaluation = json.loads((folder / "evaluation.json").read_text())
+    for name, value in (("planner", 0.25), ("actor", 0.5)):
+        evaluation[name]["chatter"] = value
+    (folder / "evaluation.json").write_text(json.dumps(evaluation))
+    run = read_runs(tmp_path).runs[0]
+    assert [six_tasks.chatter(run, name) for name in ("planner", "actor")] == [0.25, 0.5]
+
+
+def test_time_to_the_published_return_is_that_of_the_first_actor_to_earn_it(tmp_path):
+    curve = ((1000, -900.0), (1000, -262.0), (1000, -300.0))
+    make_run(tmp_path, seed=100, curve=curve)
+    run = read_runs(tmp_path).runs[0]
+    assert six_tasks.seconds_until(run, -263.0) == 1.0
+    assert six_tasks.seconds_until(run, -100.0) == math.inf
+    page = six_tasks.page([run])
+    assert "Training seeds 100." in page
+    assert "Not run yet: pendulum-swingup" in page
