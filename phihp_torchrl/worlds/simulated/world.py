@@ -82,6 +82,7 @@ class SimulatedWorld(World):
     """
 
     kind = SimulatedConfig.kind
+    copies = True
 
     def __init__(self, task: str | Task, config: SimulatedConfig | None = None) -> None:
         super().__init__(find_task(task))
