@@ -1,12 +1,13 @@
 r"""What a user of the defaults gets on the six tasks: returns, smoothness, and the time it takes.
 
-    python benchmarks/paper/run_grid.py method=phihp seed=101,102 \
+    python benchmarks/paper/run_grid.py seed=101,102 results=results/six_tasks \
         task=pendulum,pendulum-swingup,cartpole,cartpole-swingup,acrobot,acrobot-swingup
     python benchmarks/paper/six_tasks.py
 
-Reads the kept runs of default settings with training seeds from 100 on, in results/runs, and writes
-results/six_tasks/README.md. It runs nothing and chooses nothing. Means are over training seeds, and
-so are their intervals: episodes of one seed share their agent, so that a seed counts once.
+Reads the kept runs of default settings with training seeds from 100 on, and writes
+results/six_tasks/README.md beside them; the runs in results/runs are of version 0.1.0. It runs
+nothing and chooses nothing. Means are over training seeds, and so are their intervals: episodes of
+one seed share their agent, so that a seed counts once.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from measures import paired_difference_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, markdown_table
 from report.runs import Run, read_runs
 
-RUNS, RESULTS = Path("results/runs"), Path("results/six_tasks")
+RESULTS = Path("results/six_tasks")
 TASKS = ("pendulum", "pendulum-swingup", "cartpole", "cartpole-swingup", "acrobot",
          "acrobot-swingup")  # fmt: skip
 FIRST_SEED = 100
@@ -107,8 +108,8 @@ def page(runs: Sequence[Run]) -> str:
     machines = "; ".join(sorted({run.machine for run in used}))
     return (
         "# The six tasks from defaults\n\n"
-        "Made by `python benchmarks/paper/six_tasks.py` from runs of `run_grid.py` in "
-        "`results/runs/`. Do not edit. *Agent* is what is saved: its plans, or its actor where "
+        "Made by `python benchmarks/paper/six_tasks.py` from the runs of `run_grid.py` in the "
+        "folders beside it. Do not edit. *Agent* is what is saved: its plans, or its actor where "
         "calibration in imagination found that no plan earns more. *Chatter* is the mean change of "
         "the action from step to step in the second half of an episode, in half-ranges. *aim* is "
         "the return of version 0.1.0. *s to published* are the seconds of a run, its real steps "
@@ -125,15 +126,13 @@ def page(runs: Sequence[Run]) -> str:
 def main() -> None:
     """Read and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=Path, default=RUNS)
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    arguments = parser.parse_args()
-    runs = read_runs(arguments.runs, any_version=True).runs
+    parser.add_argument("--results", type=Path, default=RESULTS, help="where the runs are")
+    results = parser.parse_args().results
+    runs = read_runs(results, any_version=True).runs
     if not any(ours(runs, task) for task in TASKS):
-        parser.exit(1, f"{arguments.runs}: expected default runs of seeds from {FIRST_SEED} on.\n")
-    arguments.results.mkdir(parents=True, exist_ok=True)
+        parser.exit(1, f"{results}: expected default runs of seeds from {FIRST_SEED} on.\n")
     text = page(runs)
-    (arguments.results / "README.md").write_text(text)
+    (results / "README.md").write_text(text)
     print(text)
 
 
