@@ -20,6 +20,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from measures import agent_in
 from phihp_torchrl import load_config, run
 from phihp_torchrl.evaluation import evaluate, evaluation_seed, markdown_table
 from phihp_torchrl.origin import commit_text, machine_text
@@ -94,7 +95,7 @@ def learn_in(task: str, plant: str, seed: int, path: Path) -> dict[str, Any] | N
 
 def agent_of(found: Mapping[str, Any]) -> float:
     """Mean return of the agent: its plans, or its actor where calibration let that act."""
-    returns = found["returns"].get("planner") or found["returns"]["actor"]
+    returns = found["returns"][agent_in(found["returns"])]
     return math.fsum(returns) / len(returns)
 
 
@@ -111,7 +112,7 @@ def page(entries: Sequence[Mapping[str, Any]]) -> str:
         same = [e for e in entries if (e["task"], e["seed"]) == (found["task"], found["seed"])]
         without = [e for e in same if e["plant"] == AS_IT_IS]
         share = f"{100 * lost(found, without[0]):.1f}" if without else "–"
-        acting = "planner" if "planner" in found["returns"] else "actor"
+        acting = agent_in(found["returns"])
         chatter = found["chatter"][acting]
         rows.append([found["task"], found["plant"], str(found["seed"]), f"{agent_of(found):.1f}",
                      share, "–" if chatter is None else f"{chatter:.3f}", acting])  # fmt: skip
@@ -126,7 +127,8 @@ def page(entries: Sequence[Mapping[str, Any]]) -> str:
         "told nothing of what the world does to commands and to what sensors show. Returns are "
         f"means of {EPISODES} episodes in that world. *lost %* is the share of the return above "
         "the floor (what doing nothing earns) that is lost, beside the same training seed in the "
-        f"world as it is. Noise is {noise}. Floors: {floors}.\n\n"
+        "world as it is, whose episodes start elsewhere in the same box. "
+        f"Noise is {noise}. Floors: {floors}.\n\n"
         f"{markdown_table(header, rows)}\n"
         f"Commits: {commits}. Machines: {machines}, shared with other work.\n"
     )

@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from measures import paired_difference_of_seeds
+from measures import agent_in, paired_difference_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, markdown_table
 from report.runs import Run, read_runs
 
@@ -43,15 +43,10 @@ def ours(runs: Sequence[Run], task: str) -> list[Run]:
     return sorted((run for run in kept if run.seed >= FIRST_SEED), key=lambda run: run.seed)
 
 
-def player(run: Run, name: str) -> str:
-    """Who plays for ``name``: where calibration let the actor act, the agent is the actor."""
-    return name if name in run.acting else "actor"
-
-
 def chatter(run: Run, name: str) -> float:
     """Mean change of the action in the second halves of the episodes, in half-ranges."""
     evaluation = json.loads((run.folder / "evaluation.json").read_text())
-    return float(evaluation[player(run, name)].get("chatter", math.nan))
+    return float(evaluation[name].get("chatter", math.nan))
 
 
 def seconds_until(run: Run, level: float) -> float:
@@ -85,10 +80,10 @@ def row(task: str, runs: Sequence[Run]) -> list[str]:
         task,
         str(len(runs)),
         f"{runs[0].samples:,}",
-        spread(each(lambda run: run.acting[player(run, "planner")].mean), 1),
+        spread(each(lambda run: run.acting[agent_in(run.acting)].mean), 1),
         f"{AIMS[task]:g}",
         spread(each(lambda run: run.acting["actor"].mean), 1),
-        spread(each(lambda run: chatter(run, "planner")), 3),
+        spread(each(lambda run: chatter(run, agent_in(run.acting))), 3),
         spread(each(lambda run: chatter(run, "actor")), 3),
         f"{sum(times) / len(times):.0f}" if times else "–",
         f"{sum(each(lambda run: sum(run.seconds.values()))) / len(runs):.0f}",
@@ -114,8 +109,9 @@ def page(runs: Sequence[Run]) -> str:
         "the action from step to step in the second half of an episode, in half-ranges. *aim* is "
         "the return of version 0.1.0. *s to published* are the seconds of a run, its real steps "
         "and the fits of its model among them, until the actor first earned the published mean "
-        "return of PhIHP in ten episodes of the world; *s in all* has calibration and the "
-        "evaluation of 50 episodes too. Brackets are 95 % intervals over training seeds.\n\n"
+        "return of PhIHP in ten episodes of the world, and inf where it never did; *s in all* has "
+        "calibration and the evaluation of 50 episodes too. Brackets are 95 % intervals over "
+        "training seeds.\n\n"
         f"{markdown_table(header, rows)}\n"
         + (f"Not run yet: {', '.join(missing)}.\n\n" if missing else "")
         + f"Training seeds {seeds}. Commits: {commits}. Machines: {machines}, shared with other "

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from measures import agent_in
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import commit_text, machine_text
 
@@ -68,18 +69,15 @@ def ours(runs: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[Score]
     for name in names:
         found = [run for run in runs if run["task"] == name]
         for player, label in PLAYERS.items():
-            means = [float(np.mean(_returns(run, player))) for run in found]
+            returns = (run["returns"] for run in found)
+            means = [
+                float(np.mean(r[agent_in(r) if player == "planner" else player])) for r in returns
+            ]
             if means:
                 steps = max(run["environment_steps"] for run in found)
                 spread = (float(np.mean(means)), min(means), max(means))
                 scores.append(Score(name, label, steps, *spread, len(means)))
     return scores
-
-
-def _returns(run: Mapping[str, Any], player: str) -> list[float]:
-    """Returns of a player; where calibration let the actor act, the agent is the actor."""
-    returns: Mapping[str, list[float]] = run["returns"]
-    return returns[player] if player in returns else returns["actor"]
 
 
 def write_report(results: Path, names: Sequence[str]) -> None:

@@ -8,7 +8,7 @@ from phihp_torchrl.evaluation.figures import Curve, episode_figure
 from phihp_torchrl.evaluation.latency import Latency, measure_latency
 from phihp_torchrl.evaluation.predicted import EVERY, Predictions, predict_episode
 from phihp_torchrl.evaluation.published import PUBLISHED, TARGETS, Published
-from phihp_torchrl.evaluation.returns import Evaluation, evaluate
+from phihp_torchrl.evaluation.returns import AT_ONCE, Evaluation, evaluate
 from phihp_torchrl.evaluation.seeds import (
     EVALUATION_SEED,
     PROOF_SEED,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
 import torch
@@ -25,7 +26,8 @@ from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld, World
 
 _log = logging.getLogger(__name__)
-_AT_ONCE = 64  # environments of a world at most
+AT_ONCE = 64
+"""Environments of a world in which evaluation plays at once, at most."""
 DOING = "playing episodes"
 """What a run says that it is doing while this is on its stack."""
 
@@ -143,26 +145,25 @@ def evaluate(
     episodes = whole("episodes", episodes, "a positive whole number", 1)
     seed = whole("seed", seed, "a whole number from 0 on", 0)
     task = find_task(task)
-    model = None
-    if env is None:
-        world = SimulatedWorld(task) if world is None else world
-        model = world.model()
-        env = _make_env(world, episodes) if model is None else None
-    if env is not None and len(env.batch_size) > 1:
-        raise ConfigError("env", f"expected batch size [] or [n], got {list(env.batch_size)}.")
-    device = torch.device(device or "cpu") if env is None else (env.device or torch.device("cpu"))
-    start, first = time.perf_counter(), None
-    cuda = [device] if device.type == "cuda" else []
-    with torch.random.fork_rng(devices=cuda), torch.no_grad():
-        torch.manual_seed(seed if noise_seed is None else noise_seed)
-        if model is not None:
-            played, first = _play_model(policy, model, task, episodes, seed, device)
-        else:
-            assert env is not None  # one of the two is there
-            env.set_seed(seed)
-            rounds = math.ceil(episodes / env.batch_size.numel())
-            columns = zip(*(_play_env(policy, env, task) for _ in range(rounds)), strict=True)
-            played = tuple(torch.cat(column)[:episodes] for column in columns)
+    with ExitStack() as stack:
+        model = None
+        if env is None:
+            world = SimulatedWorld(task) if world is None else world
+            model = world.model()
+            env = None if model else stack.enter_context(_environments(world, episodes))
+        if env is not None and len(env.batch_size) > 1:
+            raise ConfigError("env", f"expected batch size [] or [n], got {list(env.batch_size)}.")
+        where = device if env is None else env.device
+        device = torch.device(where or "cpu")
+        start, first = time.perf_counter(), None
+        cuda = [device] if device.type == "cuda" else []
+        with torch.random.fork_rng(devices=cuda), torch.no_grad():
+            torch.manual_seed(seed if noise_seed is None else noise_seed)
+            if model is not None:
+                played, first = _play_model(policy, model, task, episodes, seed, device)
+            else:
+                assert env is not None  # one of the two is there
+                played = _play_rounds(policy, env, task, episodes, seed)
     returns, lengths, terminated, chatter, steps, largest = (column.cpu() for column in played)
     seconds = time.perf_counter() - start
     found = zip(task.limits.names, steps.unbind(-1), largest.unbind(-1), strict=True)
@@ -171,10 +172,19 @@ def evaluate(
     return Evaluation(task.name, seed, *own, first)
 
 
-def _make_env(world: World, episodes: int) -> EnvBase:
+@contextmanager
+def _environments(world: World, episodes: int) -> Iterator[EnvBase]:
     """An environment of the world, or a batch of them where each is a world of its own."""
-    count = min(episodes, _AT_ONCE)
-    return SerialEnv(count, world.make_env) if world.copies and count > 1 else world.make_env()
+    count = min(episodes, AT_ONCE)
+    if not world.copies or count == 1:
+        yield world.make_env()
+        return
+    threads, several = torch.get_num_threads(), SerialEnv(count, world.make_env)
+    try:
+        yield several
+    finally:
+        several.close()
+        torch.set_num_threads(threads)  # which the end of a batch of environments changes
 
 
 def _play_model(
@@ -229,6 +239,19 @@ def _first_episode(
     actions, rewards = (column.double().cpu().numpy() for column in columns)
     states = task.locate(torch.stack(observed[: length + 1]).double()).cpu().numpy()
     return Episode(task, states, actions, rewards, bool(tally.terminated[0]))
+
+
+def _play_rounds(
+    policy: TensorDictModuleBase, env: EnvBase, task: Task, episodes: int, seed: int
+) -> tuple[Tensor, ...]:
+    """What a tally has of the episodes, played in as many rounds as the environments need."""
+    count, columns, following = env.batch_size.numel(), [], env.set_seed(seed)
+    for k in range(math.ceil(episodes / count)):
+        # Where an episode was over early, its environment has begun others, by what it drew next.
+        if k and env.batch_size:
+            following = env.set_seed(following)
+        columns.append(_play_env(policy, env, task))
+    return tuple(torch.cat(column)[:episodes] for column in zip(*columns, strict=True))
 
 
 def _play_env(policy: TensorDictModuleBase, env: EnvBase, task: Task) -> tuple[Tensor, ...]:

@@ -7,6 +7,7 @@ follows from settings and measured rates alone, whether the compiler's cache is 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,8 @@ from typing import Any
 
 from phihp_torchrl.config import resolve_seconds
 from phihp_torchrl.display import duration
-from phihp_torchrl.trainers.planned_acts import PLANNED, SEARCH
+from phihp_torchrl.evaluation import AT_ONCE
+from phihp_torchrl.trainers.planned_acts import PLANS_END, SEARCH
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.worlds import World
 
@@ -135,7 +137,8 @@ def _policy(config: RunConfig, settings: Any, world: World) -> Earned:
     if settings.method == "td3":
         rounds = updates / td3.policy_delay
         each = (td3.policy_delay + 1) * _GRADIENT + (td3.value_expansion - 1) * _STEP
-        saved = rounds * each + updates / settings.updates_per_step * _STEP
+        alone = updates / settings.updates_per_step * (1.0 - _planned(settings))
+        saved = rounds * each + alone * _STEP
         taken += _SECONDS["update"] + _SECONDS["chunk"]
     elif settings.method == "analytic":
         horizon, critics = settings.analytic.horizon, settings.analytic.critic_updates
@@ -158,11 +161,16 @@ def _policy_steps(config: RunConfig, settings: Any, world: World) -> float:
     played = settings.evaluation_steps or world.task.max_steps
     calls = (1 + updates / settings.evaluation_interval) * played
     if settings.method == "td3":
-        planned = PLANNED * SEARCH.planning_horizon * SEARCH.optim_steps
-        calls += updates / settings.updates_per_step * (1 + (settings.planned > 0) * planned)
+        plan = SEARCH.planning_horizon * SEARCH.optim_steps
+        calls += updates / settings.updates_per_step * (1 + _planned(settings) * plan)
     if refit.interval:
         calls += (1 + max(0.0, updates - refit.start) / refit.interval) * refit.horizon
     return calls
+
+
+def _planned(settings: Any) -> float:
+    """The share of imagined steps in which plans act in some world, which are not compiled."""
+    return PLANS_END if settings.planned > 0.0 else 0.0
 
 
 def _calibrate_steps(config: RunConfig, settings: Any, world: World) -> float:
@@ -171,8 +179,8 @@ def _calibrate_steps(config: RunConfig, settings: Any, world: World) -> float:
 
 def _evaluate_steps(config: RunConfig, settings: Any, world: World) -> float:
     """Calls of the model by plans: of all episodes at once, or of one after the other."""
-    at_once = world.truth is not None or world.copies
-    alone = 1 if at_once else settings.episodes * world.has_env
+    at_once = AT_ONCE if world.copies else 1
+    alone = math.ceil(settings.episodes / at_once) * world.has_env
     return (alone * world.task.max_steps + settings.latency_actions) * _plan_steps(config)
 
 
@@ -200,7 +208,7 @@ def _tdmpc(config: RunConfig, settings: Any, world: World) -> Earned:
 
 def _evaluate(config: RunConfig, settings: Any, world: World) -> Earned:
     # Where the episodes are a batch, a plan is nearly all arithmetic, and is never compiled.
-    if config.planner is None or world.truth is not None or world.copies or not world.has_env:
+    if config.planner is None or world.copies or not world.has_env:
         return Earned(0.0, 0.0)
     plans = settings.episodes * world.task.max_steps + settings.latency_actions
     steps = _plan_steps(config)

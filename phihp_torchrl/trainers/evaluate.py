@@ -187,7 +187,7 @@ class EvaluatePhase:
     def _evaluate(self, name: str, agent: Agent) -> dict[str, float]:
         settings, task = self.settings, self.agent.task
         played = evaluate(
-            _eager(agent) if self.world.truth is not None or self.world.copies else agent,
+            _eager(agent) if self.world.copies else agent,
             task,
             episodes=settings.episodes,
             seed=settings.first_seed,

@@ -11,10 +11,9 @@ from phihp_torchrl.planners import CEMConfig, Problem, cem_plan
 from phihp_torchrl.tasks import ActionBounds
 
 SEARCH = CEMConfig()
-"""The search of these plans, the default planner's; it has the discount of the critics."""
-_FALL, _END = 0.25, 0.5
-PLANNED = (_FALL + _END) / 2
-"""The share of the updates with plans, each counted by the share of plans that is left."""
+"""The search of these plans, by the planner's defaults; it has the discount of the critics."""
+_PLANS_FALL, PLANS_END = 0.25, 0.5
+"""Shares of the updates from which on plans give way to the actor, and after which none act."""
 
 
 def planned_share(done: float) -> float:
@@ -26,16 +25,16 @@ def planned_share(done: float) -> float:
         >>> [planned_share(done) for done in (0.1, 0.25, 0.375, 0.5, 0.9)]
         [1.0, 1.0, 0.5, 0.0, 0.0]
     """
-    return min(1.0, max(0.0, (_END - done) / (_END - _FALL)))
+    return min(1.0, max(0.0, (PLANS_END - done) / (PLANS_END - _PLANS_FALL)))
 
 
 class PlannedActs:
     """A policy of imagined worlds: plans act in the first of them, and the actor in the others.
 
-    The plans are those of the published planner with the networks as they are, which look ahead in
-    the model where the actor can only repeat what it has learned. What they meet goes into the
-    replay like all else, and TD3 learns from it, whoever acted (guided policy search, Levine and
-    Koltun, 2013, has its demonstrations from a planner in the same way).
+    The plans are sought as the agent's are, by default settings and with the networks as they are.
+    They look ahead in the model where the actor can only repeat what it has learned. What they meet
+    goes into the replay like all else, and TD3 learns from it, whoever acted (guided policy search,
+    Levine and Koltun, 2013, has its demonstrations from a planner in the same way).
 
     Args:
         world_model: the model by which to plan, in the units of the networks.

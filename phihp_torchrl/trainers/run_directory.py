@@ -20,6 +20,8 @@ _BEFORE = {
     ("model", "fit", "shuffle_actions"): False,
     ("policy", "refit", "interval"): 0,
     ("policy", "refit", "start"): 0,
+    ("policy", "extension"): 0.0,
+    ("policy", "planned"): 0.0,
 }
 
 

@@ -165,7 +165,7 @@ class GuardedWorld(World):
     def __init__(self, world: World, guards: Guards) -> None:
         super().__init__(world.task)
         read_guards(world.task, guards)
-        self.world, self.guards, self.copies = world, guards, world.copies
+        self.world, self.guards = world, guards  # one at a time, so that crossings can be counted
         self.crossings: Counter[str] = Counter()
 
     def make_env(self, *, render: bool = False) -> EnvBase:

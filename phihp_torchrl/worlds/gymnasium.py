@@ -26,8 +26,9 @@ class GymnasiumConfig:
     Args:
         id: gymnasium id, e.g. Pendulum-v1; module:id imports the module that registers it.
         options: keyword arguments of gymnasium.make.
-        copies: whether each environment is a world of its own, as simulators are, so that several
-            episodes can be evaluated at once; set it to false for a rig.
+        copies: whether each environment is a world of its own, as of a simulator, so that several
+            episodes can be evaluated at once; null for those that come with gymnasium or this
+            package, and are not shown in a window.
 
     Examples:
         >>> from phihp_torchrl import make_world
@@ -39,7 +40,7 @@ class GymnasiumConfig:
 
     id: str
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
-    copies: bool = True
+    copies: bool | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -72,7 +73,8 @@ class GymnasiumWorld(EnvWorld):
 
     def __init__(self, task: Task, config: GymnasiumConfig) -> None:
         label = f"gymnasium {config.id}"
-        super().__init__(task, self._wrap, label=label, copies=config.copies)
+        copies = _is_simulator(config) if config.copies is None else config.copies
+        super().__init__(task, self._wrap, label=label, copies=copies)
         self.config = config
 
     def make_env(self, *, render: bool = False) -> EnvBase:
@@ -95,3 +97,15 @@ class GymnasiumWorld(EnvWorld):
                 f"expected continuous actions, {self.config.id!r} has {env.action_space}.",
             )
         return GymWrapper(env)
+
+
+def _is_simulator(config: GymnasiumConfig) -> bool:
+    """Whether the id is known to be a simulator's: others may open a rig, of which there is one."""
+    if config.options.get("render_mode") == "human":
+        return False
+    try:
+        entry = gymnasium.spec(config.id).entry_point
+    except (gymnasium.error.Error, ImportError):
+        return False  # making it will say what is wrong
+    module = entry if isinstance(entry, str) else getattr(entry, "__module__", "")
+    return module.startswith(("gymnasium.", "phihp_torchrl."))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import re
 from dataclasses import replace
@@ -18,7 +19,7 @@ from torchrl.envs import GymEnv
 from phihp_torchrl import evaluate, get_task
 from phihp_torchrl.agents import Actor, make_actor
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.evaluation import measure_latency, play_episode
+from phihp_torchrl.evaluation import measure_latency, play_episode, returns
 from phihp_torchrl.tasks import list_tasks
 from phihp_torchrl.worlds import (
     EnvWorld,
@@ -159,17 +160,56 @@ def test_a_world_that_is_not_simulated_plays_episodes_from_its_seed(copies):
     assert episode.total_reward == pytest.approx(result.returns[0].item(), rel=1e-5)
 
 
-@pytest.mark.parametrize(("copies", "guarded"), [(True, False), (True, True), (False, False)])
-def test_episodes_are_played_at_once_where_each_environment_is_a_world(copies, guarded):
+@pytest.mark.parametrize("copies", [True, False])
+def test_episodes_are_played_at_once_where_each_environment_is_a_world(copies):
     task = replace(get_task("cartpole"), max_steps=120)
     world = EnvWorld(task, SimulatedWorld(task).make_env, copies=copies)
     policy = Noisy()
-    played = GuardedWorld(world, {"x": 2.0}) if guarded else world
-    result = evaluate(policy, task, episodes=4, seed=0, world=played)
+    result = evaluate(policy, task, episodes=4, seed=0, world=world)
     assert policy.starts[0].shape == ((4, 1) if copies else (1,))
     assert result.lengths.shape == (4,)
     assert torch.equal(result.returns, result.lengths.to(torch.float64))
     assert len(set(result.lengths.tolist())) > 1, "each starts elsewhere"
+
+
+def test_later_rounds_start_where_they_do_whoever_plays(monkeypatch):
+    monkeypatch.setattr(returns, "AT_ONCE", 3)
+    task = replace(get_task("cartpole"), max_steps=60)
+    world = EnvWorld(task, SimulatedWorld(task).make_env, copies=True)
+    firsts = []
+    for push in (1.0, 10.0):  # one of them ends sooner, and its worlds begin again
+        seen: list[torch.Tensor] = []
+
+        def act(data, push=push, seen=seen):
+            if data["is_init"].all():
+                seen.append(data["observation"].clone())
+            return data.set("action", torch.full((len(data), 1), push))
+
+        assert evaluate(act, task, episodes=6, seed=0, world=world).lengths.shape == (6,)
+        firsts.append(torch.cat(seen))
+    assert firsts[0].shape == (6, 5)
+    torch.testing.assert_close(firsts[0], firsts[1])
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_threads_are_left_alone(threads):
+    before = torch.get_num_threads()
+    task = replace(get_task("pendulum"), max_steps=3)
+    try:
+        torch.set_num_threads(threads)
+        world = EnvWorld(task, SimulatedWorld(task).make_env, copies=True)
+        evaluate(constant(1.0), task, episodes=3, world=world)
+        gc.collect()
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_guarded_worlds_are_played_one_after_the_other():
+    """A world that begins again, while others go on, would add crossings that no episode had."""
+    task = get_task("cartpole")
+    world = EnvWorld(task, SimulatedWorld(task).make_env, copies=True)
+    assert not GuardedWorld(world, {"x": 2.0}).copies
 
 
 def test_one_environment_has_no_copies():

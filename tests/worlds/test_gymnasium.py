@@ -149,3 +149,21 @@ def test_a_task_that_wants_more_than_the_world_gives_is_refused():
     )
     gentle = replace(PENDULUM, name="gentle", action_high=(1.0,), action_low=(0.0,))
     assert world(task=gentle).make_env().rollout(2).shape == (2,)
+
+
+@pytest.mark.parametrize(
+    ("id", "options", "copies", "expected"),
+    [
+        ("Pendulum-v1", {}, None, True),
+        ("phihp/Pendulum-v0", {}, None, True),
+        ("Pendulum-v1", {"render_mode": "human"}, None, False),
+        ("Pendulum-v1", {}, False, False),
+        ("tests/Rig-v0", {}, None, False),
+        ("tests/Rig-v0", {}, True, True),
+        ("no/Such-v0", {}, None, False),
+    ],
+)
+def test_many_are_made_of_what_is_known_to_be_a_simulator(id, options, copies, expected):
+    gymnasium.register("tests/Rig-v0", entry_point="my_rig:Rig")
+    assert GymnasiumWorld(PENDULUM, GymnasiumConfig(id, options, copies)).copies is expected
+    gymnasium.registry.pop("tests/Rig-v0")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from measures.acting import agent_in
 from measures.censored import Between, mean_between, ratio_between
 from measures.configuration import configuration_hash
 from measures.curve import CurvePoint, curve_from_metrics, read_curve, write_curve
@@ -34,6 +35,7 @@ __all__ = [
     "Difference",
     "PairedDifference",
     "UnseenEpisodes",
+    "agent_in",
     "configuration_hash",
     "curve_from_metrics",
     "difference",
