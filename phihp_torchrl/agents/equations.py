@@ -145,30 +145,40 @@ def actor_loss(
     observation: Tensor,
     bounds: ActionBounds,
     saturation_cost: float = 0.0,
+    change_cost: float = 0.0,
+    next_observation: Tensor | None = None,
 ) -> Tensor:
-    r"""-Q1(s, pi(s)), averaged over the batch, and the price of saturated outputs.
+    r"""-Q1(s, pi(s)), averaged over the batch, and prices of saturated and of restless outputs.
 
     .. math::
-        -\overline{Q_1(s, \pi(s))} + c\, \sigma(Q_1)\, \overline{\max(|u| - 2, 0)^2}
+        -\overline{Q_1(s, \pi(s))} + \sigma(Q_1) \left( c_s\, \overline{\max(|u| - 2, 0)^2}
+        + c_\Delta\, \overline{(\tanh u' - \tanh u)^2} \right)
 
     u is the actor's output before its tanh. Where that is far out, the slope of tanh is 0, and no
     value that the critics find later reaches the actor any more (Wang et al., 2020,
-    arXiv:1910.02208).
+    arXiv:1910.02208). u' is its output in the next state, which an actor that is driven to and fro
+    changes much for little (Mysore et al., 2021, arXiv:2012.06644).
 
     Args:
         actor: layers of the actor.
         critics: layers of the critics, of which the first is used.
         observation: observations ``[N, o]``.
         bounds: bounds of the action.
-        saturation_cost: c, in standard deviations σ of the values of the batch.
+        saturation_cost: the first price, in standard deviations σ of the values of the batch.
+        change_cost: the second price, in the same units.
+        next_observation: observations after the batch's transitions, ``[N, o]``, for that.
     """
     output = mlp(actor, observation)
+    unit = output.tanh()
     first = [layer[:1] for layer in critics]
-    value = q_values(first, observation, bounds.from_unit(output.tanh()), bounds)
-    loss = -value.mean()
+    value = q_values(first, observation, bounds.from_unit(unit), bounds)
+    loss, scale = -value.mean(), value.detach().std(correction=0)
     if saturation_cost:
         beyond = (output.abs() - SATURATED).clamp_min(0.0)
-        loss = loss + saturation_cost * value.detach().std(correction=0) * beyond.square().mean()
+        loss = loss + saturation_cost * scale * beyond.square().mean()
+    if change_cost and next_observation is not None:
+        change = mlp(actor, next_observation).tanh() - unit
+        loss = loss + change_cost * scale * change.square().mean()
     return loss
 
 

@@ -61,6 +61,9 @@ class TD3Config:
         saturation_cost: price of saturated actions in the actor's loss: of the square of outputs
             beyond 2 before their tanh, in standard deviations of the values of a batch. It keeps an
             actor learning that has met no reward so far; 0 for none.
+        change_cost: price of the change of the actor's action from a state to the next, squared, in
+            half-ranges, in the same units; 0 for none. It keeps an actor calm where values hardly tell
+            one action from another, as at rest.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.
@@ -85,6 +88,7 @@ such as '5 s', got 1.5.
     target_noise_clip: float = 0.5
     value_expansion: Steps = 1
     saturation_cost: float = 0.0
+    change_cost: float = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -94,9 +98,8 @@ such as '5 s', got 1.5.
         check_steps(self, "value_expansion")
         check_discount(self, "gamma")
         check_positive_share(self, "tau")
-        check_not_negative(
-            self, "target_noise", "target_noise_clip", "last_layer_scale", "saturation_cost"
-        )
+        check_not_negative(self, "target_noise", "target_noise_clip", "last_layer_scale")
+        check_not_negative(self, "saturation_cost", "change_cost")
 
 
 def make_td3_loss(world_model: TaskWorldModel, config: TD3Config) -> TD3Loss:
@@ -252,6 +255,7 @@ class TD3Update(ActorCriticUpdate):
             )
             rates = (rate[i] for rate in critic_rates)
             adam_(nets.critics, gradients, nets.critic_means, nets.critic_squares, *rates)
+        following = batch.next_state.chunk(config.policy_delay)[-1] if config.change_cost else None
         gradients, loss_actor = grad_and_value(
             actor_loss,
             nets.actor,
@@ -259,6 +263,8 @@ class TD3Update(ActorCriticUpdate):
             observation,
             bounds,
             config.saturation_cost,
+            config.change_cost,
+            None if following is None else observe(following),
         )
         adam_(nets.actor, gradients, nets.actor_means, nets.actor_squares, *actor_rates)
         soft_update_(nets.target_actor, nets.actor, config.tau)

@@ -200,6 +200,20 @@ def test_saturated_actors_pay_and_come_back():
     assert _loss_and_slope(near, observation, 0.1) == _loss_and_slope(near, observation, 0.0)
 
 
+def test_restless_actors_pay_for_what_changes_from_a_state_to_the_next():
+    observation = observe(torch.tensor([[0.0, 1.0], [0.0, -5.0]]))
+    actor = [torch.tensor([[0.0, 0.0, 0.1]]), torch.zeros(1)]  # tanh(0.1 velocity)
+    following = observe(torch.tensor([[0.0, 1.0], [0.0, 0.0]]))
+    free = actor_loss(actor, FLAT_CRITICS, observation, BOUNDS)
+    args = observation, BOUNDS, 0.0, 0.1
+    still = actor_loss(actor, FLAT_CRITICS, *args, observation)
+    assert still == free, "nothing changes"
+    loss = actor_loss(actor, FLAT_CRITICS, *args, following)
+    values = torch.tensor([11 + 2 * math.tanh(0.1), 5 + 2 * math.tanh(-0.5)])
+    price = 0.1 * values.std(correction=0).item() * math.tanh(0.5) ** 2 / 2
+    assert (loss - free).item() == pytest.approx(price, rel=1e-5)
+
+
 def _loss_and_slope(actor, observation, price):
     weight, bias = actor
     bias = bias.clone().requires_grad_()
