@@ -62,8 +62,8 @@ class TD3Config:
             beyond 2 before their tanh, in standard deviations of the values of a batch. It keeps an
             actor learning that has met no reward so far; 0 for none.
         change_cost: price of the change of the actor's action from a state to the next, squared, in
-            half-ranges, in the same units; 0 for none. It keeps an actor calm where values hardly tell
-            one action from another, as at rest.
+            half-ranges, in the same units; 0 for none. It keeps an actor calm where values hardly
+            tell one action from another, as at rest.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.
