@@ -134,7 +134,7 @@ def default_of(f: Field) -> Any:
     Examples:
         >>> from phihp_torchrl.worlds import TorchRLConfig
         >>> {f.name: default_of(f) for f in fields(TorchRLConfig)}
-        {'make': '???', 'options': {}}
+        {'make': '???', 'options': {}, 'copies': False}
     """
     if f.default is not MISSING:
         return f.default

@@ -38,7 +38,8 @@ def test_a_gymnasium_id_from_training_to_playing(
     assert list(dict.fromkeys(metrics_column(run, "phase"))) == ["model", "policy", "evaluate"]
     kept = yaml.safe_load((run / "config.yaml").read_text())
     assert kept["task"] == "pendulum"  # nobody named it
-    assert kept["world"] == {"kind": "gymnasium", "id": "Pendulum-v1", "options": {}}
+    expected = {"kind": "gymnasium", "id": "Pendulum-v1", "options": {}, "copies": None}
+    assert kept["world"] == expected
     phihp("train", "resume=run")  # there is nothing left to do
     phihp("evaluate", "agent=run/agent", *PLAY)
     assert "pendulum in gymnasium Pendulum-v1" in capsys.readouterr().out

@@ -161,12 +161,12 @@ def test_a_callers_defaults_of_dtype_and_device_change_no_result(
     assert agent(TensorDict(observation=start))["action"].dtype == torch.float32
 
 
-@pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.parametrize("copies", [True, False])
 def test_plans_are_compiled_where_they_are_made_one_at_a_time(
-    whole: Path, monkeypatch: pytest.MonkeyPatch, simulated: bool
+    whole: Path, monkeypatch: pytest.MonkeyPatch, copies: bool
 ) -> None:
     agent, compiled = load_agent(whole / "agent", compile=True), list[bool]()
-    world: Any = SimpleNamespace(truth=agent.task.system if simulated else None, has_env=True)
+    world: Any = SimpleNamespace(copies=copies, has_env=True)
 
     def played(acting: Any, *_: Any, **__: Any) -> Evaluation:
         compiled.append(acting.planner._compiles)
@@ -182,4 +182,4 @@ def test_plans_are_compiled_where_they_are_made_one_at_a_time(
     monkeypatch.setattr(module, "measure_latency", timed)
     phase = EvaluatePhase(agent, CONFIG, EvaluateConfig(), world, RunDirectory(whole), 0)
     phase.advance()
-    assert compiled == [not simulated, True], "returns, and the time of a plan"
+    assert compiled == [not copies, True], "returns, and the time of a plan"

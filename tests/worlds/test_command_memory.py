@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import SerialEnv
 
 from phihp_torchrl import Agent, get_task, load_agent, save_agent
 from phihp_torchrl.agents import Actor
@@ -50,7 +51,9 @@ def test_an_agent_remembers_what_the_environment_would_show(task):
     hidden = SimulatedWorld(get_task("pendulum"), SimulatedConfig(actuator=LATE.config))
     shown = SimulatedWorld(task)
     blind = evaluate(agent, get_task("pendulum"), episodes=3, world=hidden)
-    seeing = evaluate(agent, task, episodes=3, world=shown, env=shown.make_env())
+    several = SerialEnv(3, shown.make_env)
+    seeing = evaluate(agent, task, episodes=3, env=several)
+    several.close()
     torch.testing.assert_close(blind.returns, seeing.returns)
 
 
