@@ -34,7 +34,7 @@ AIMS = {
     "acrobot": -91.3,
     "acrobot-swingup": 404.6,
 }
-"""Mean returns of plans of version 0.1.0, which later defaults should not fall below."""
+"""Mean returns of plans of version 0.1.0 (results/README.md), below which none should fall."""
 
 
 def ours(runs: Sequence[Run], task: str) -> list[Run]:

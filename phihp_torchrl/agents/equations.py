@@ -172,12 +172,14 @@ def actor_loss(
     unit = output.tanh()
     first = [layer[:1] for layer in critics]
     value = q_values(first, observation, bounds.from_unit(unit), bounds)
-    loss, scale = -value.mean(), value.detach().std(correction=0)
+    loss = -value.mean()
     if saturation_cost:
         beyond = (output.abs() - SATURATED).clamp_min(0.0)
+        scale = value.detach().std(correction=0)
         loss = loss + saturation_cost * scale * beyond.square().mean()
     if change_cost and next_observation is not None:
         change = mlp(actor, next_observation).tanh() - unit
+        scale = value.detach().std(correction=0)
         loss = loss + change_cost * scale * change.square().mean()
     return loss
 

@@ -71,7 +71,7 @@ class PolicyTrainer:
         seed: seed of all random numbers but the initial weights of the networks, which come from
             torch's global generator.
         data_states: states of real transitions ``[N, n]``, for ``start.data`` > 0.
-        compile: whether to compile updates, imagination, and the fit of the critics.
+        compile: whether to compile updates, imagination without plans, and the fit of the critics.
         covariance: covariance of the model's learned constants, for ``config.draw_constants``
             without ``config.constants_std``.
 

@@ -161,11 +161,13 @@ class GuardedWorld(World):
     """
 
     kind = "guarded"
+    # Where episodes are played at once, those begun meanwhile would add crossings of their own.
+    copies = False
 
     def __init__(self, world: World, guards: Guards) -> None:
         super().__init__(world.task)
         read_guards(world.task, guards)
-        self.world, self.guards = world, guards  # one at a time, so that crossings can be counted
+        self.world, self.guards = world, guards
         self.crossings: Counter[str] = Counter()
 
     def make_env(self, *, render: bool = False) -> EnvBase:
