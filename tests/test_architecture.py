@@ -16,6 +16,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "phihp_torchrl"
 FOLDERS = (
     "config",
+    "compilation",
     "display",
     "integrators",
     "systems",
@@ -36,7 +37,7 @@ FOLDERS = (
 )
 """The folders, lowest first: each imports only lower ones."""
 
-MODULES = ("compilation", "origin")
+MODULES = ("origin",)
 """Modules outside the folders, which every folder may import."""
 
 
