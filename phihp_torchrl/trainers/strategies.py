@@ -171,10 +171,10 @@ STRATEGIES: Registry[Strategy] = Registry("policy.strategies")
 """Strategies by name, in the order in which ``auto`` tries them."""
 
 STRATEGIES.register("goal", Strategy("starts where the reward is met", start_at_goal))
+STRATEGIES.register("analytic", Strategy("learns by gradients", learn_by_gradients))
 STRATEGIES.register("further", Strategy("looks further ahead", look_further))
 STRATEGIES.register("wide", Strategy("starts everywhere", start_wider))
 STRATEGIES.register("backwards", Strategy("starts ever further from the goal", start_backwards))
-STRATEGIES.register("analytic", Strategy("learns by gradients", learn_by_gradients))
 
 
 def strategies_of(config: PolicyConfig) -> tuple[str, ...]:
@@ -185,7 +185,7 @@ def strategies_of(config: PolicyConfig) -> tuple[str, ...]:
 
     Examples:
         >>> strategies_of(PolicyConfig()), strategies_of(PolicyConfig(strategies="none"))
-        (('goal', 'further', 'wide', 'backwards', 'analytic'), ())
+        (('goal', 'analytic', 'further', 'wide', 'backwards'), ())
     """
     asked = config.strategies
     if isinstance(asked, str):
