@@ -99,9 +99,10 @@ def choose(
     smoothness may cost: a tenth of the gain over the actor, or 0.3 % of the actor's return. The
     benefit of doubt ends where the loss looks twice as large as that.
 
-    The plan that is chosen acts if it earns more than the actor. If it earns less, but not by over
-    one standard error, it acts unless the actor is clearly smoother: a plan looks further than its
-    actor and is compared with it at every step, so what is in doubt is more likely a gain. Where
+    The plan that is chosen acts if it earns more than the actor, or less, but not by over one
+    standard error: a plan looks further than its actor and is compared with it at every step, so
+    what is in doubt is more likely a gain. Where the actor is clearly smoother, the plan acts only
+    if it earns more by over one standard error. Where
     both earn exactly the same in each episode, the actor, which is cheaper, acts, unless the plan
     is clearly smoother. Beyond ``confidence`` standard errors, on either side, the choice is
     certain; all else is doubtful and deserves more episodes. Those are a second look at the same
@@ -142,10 +143,14 @@ def choose(
     plan = ways[name]
     gain, error = plan.ahead_of(actor)
     same = gain == error == 0.0
-    close = not (behind[name] or actor.smoother_than(plan))
-    if doubted:
-        close = gain >= -confidence * error
-    acts = plan.smoother_than(actor) if same else gain > 0.0 or close
+    if same:
+        acts = plan.smoother_than(actor)
+    elif doubted:
+        acts = gain >= -confidence * error
+    elif actor.smoother_than(plan):
+        acts = gain > min(confidence, 1.0) * error
+    else:
+        acts = not behind[name]
     certain = same or abs(gain) > confidence * error
     return Choice(name, "planner" if acts else "actor", certain, gain, error)
 

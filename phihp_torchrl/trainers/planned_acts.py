@@ -10,8 +10,8 @@ from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.planners import CEMConfig, Problem, cem_plan
 from phihp_torchrl.tasks import ActionBounds
 
-SEARCH = CEMConfig()
-"""The search of these plans, by the planner's defaults; it has the discount of the critics."""
+SEARCH = CEMConfig(num_candidates=32, num_policy_candidates=8, top_k=4)
+"""The search of these plans, of half as many candidates as an agent's; it has the critics' γ."""
 _PLANS_FALL, PLANS_END = 0.25, 0.5
 """Shares of the updates from which on plans give way to the actor, and after which none act."""
 
@@ -31,7 +31,7 @@ def planned_share(done: float) -> float:
 class PlannedActs:
     """A policy of imagined worlds: plans act in the first of them, and the actor in the others.
 
-    The plans are sought as the agent's are, by default settings and with the networks as they are.
+    The plans are sought as the agent's are, with the networks as they are.
     They look ahead in the model where the actor can only repeat what it has learned. What they meet
     goes into the replay like all else, and TD3 learns from it, whoever acted (guided policy search,
     Levine and Koltun, 2013, has its demonstrations from a planner in the same way).

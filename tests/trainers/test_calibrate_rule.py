@@ -103,6 +103,7 @@ def test_what_is_better_is_what_the_calm_ones_are_measured_by() -> None:
     [
         ((9.0, 11.0, 9.0, 11.0), "planner", True),  # 10 ± 0.6
         ((-1.0, 4.0, -1.0, 5.0), "planner", False),  # 1.75 ± 1.6
+        ((-1.0, 4.0, -1.0, 2.0), "actor", False),  # 1 ± 1.2, and the actor is smoother
         ((-3.0, 4.0, -3.0, 1.0), "actor", False),  # -0.25 ± 1.7, and the actor is smoother
         ((-4.0, 1.0, -4.0, 1.0), "actor", False),  # -1.5 ± 1.4
         ((-9.0, -11.0, -9.0, -11.0), "actor", True),  # it is worse beyond doubt
@@ -126,7 +127,7 @@ def test_a_plan_as_smooth_as_its_actor_acts_unless_that_is_ahead_by_a_standard_e
 def test_settings_that_are_not_behind_the_actor_replace_those_that_are() -> None:
     """A plan that fails in some episodes is no better for being the one that was given."""
     failing = way(-400.0, 10.0, 10.0, -400.0)
-    other = way(5.0, -3.0, 5.0, -3.0, chatter=0.9)
+    other = way(5.0, -1.0, 5.0, -1.0, chatter=0.9)
     choice = pick(failing, other)
     assert (choice.name, choice.acting) == ("1", "planner")
     assert pick(failing, way(*(-9.0,) * 4)).acting == "actor"
