@@ -46,6 +46,14 @@ def keep(files: CellFiles) -> None:
     _replace(files.run / "evaluation.json", files.evaluation)
 
 
+def read_configuration(files: CellFiles) -> str | None:
+    """The fingerprint of the settings of a finished run; none where an earlier version kept it."""
+    if not (files.kept / CELL).is_file():
+        return None
+    found: str | None = json.loads((files.kept / CELL).read_text()).get("configuration")
+    return found
+
+
 def is_whole(files: CellFiles) -> bool:
     """Whether everything is kept that can still be had."""
     can_be_had = {CELL, CURVE} if (files.run / "evaluation.json").is_file() else set()

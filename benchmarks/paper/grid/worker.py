@@ -18,8 +18,9 @@ from hydra.core.global_hydra import GlobalHydra
 from grid.cell import CellFiles
 from grid.claim import claim
 from grid.config import GridConfig
-from grid.keep import is_whole, keep
+from grid.keep import is_whole, keep, read_configuration
 from grid.status import CellState, Status, is_done, look
+from measures import configuration_hash
 from phihp_torchrl.config import ConfigError, compose_yaml, override_lines
 from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.trainers import RunDirectory, RunRequest, read_request, run
@@ -39,7 +40,8 @@ def work(config: GridConfig, root: Path) -> CellState:
         Its state. An error of the run is a state too: it ends this cell, not the grid.
 
     Raises:
-        ConfigError: if the code has uncommitted changes, unless ``allow_dirty``.
+        ConfigError: if the code has uncommitted changes, unless ``allow_dirty``, and if the cell
+            is there of other settings, as when a default has changed since.
         KeyboardInterrupt: if a signal asked the run to stop; its checkpoint is written.
     """
     if not config.allow_dirty and describe_origin(config.seed)["dirty"]:
@@ -49,6 +51,7 @@ def work(config: GridConfig, root: Path) -> CellState:
         )
     files = config.files(root)
     if look(files).status is Status.DONE and is_whole(files):
+        _check_settings(config, files)
         return look(files)
     with claim(files.lock, config.claim_wait) as ours:
         # Only now: another process may have finished the cell, or failed at it, meanwhile.
@@ -59,6 +62,19 @@ def work(config: GridConfig, root: Path) -> CellState:
             with _logged(files.log):
                 _run(config, files)
     return look(files)
+
+
+def _check_settings(config: GridConfig, files: CellFiles) -> None:
+    """Refuse a finished cell whose settings the same words no longer give."""
+    kept = read_configuration(files)
+    settings = _request(config, files).config.to_mapping()
+    if kept is not None and kept != configuration_hash(settings):
+        raise ConfigError(
+            "results",
+            f"expected cells of the present settings, but {files.kept} is of others "
+            f"({kept}, now {configuration_hash(settings)}): keep the cells of a new default in "
+            "another directory, or move that one away.",
+        )
 
 
 def _run(config: GridConfig, files: CellFiles) -> None:

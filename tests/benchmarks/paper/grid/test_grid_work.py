@@ -104,6 +104,17 @@ def test_other_methods_leave_what_a_report_reads(
     assert "p50" in run.acting[acting].latency
 
 
+def test_a_finished_cell_of_other_settings_is_refused(finished: GridConfig) -> None:
+    changed = replace(finished, overrides=(*finished.overrides, "policy.updates=12"))
+    files = finished.files(Path())
+    before = files.evaluation.read_bytes()
+    assert do(finished).status is Status.DONE  # the same
+    with pytest.raises(ConfigError, match="cells of the present settings") as caught:
+        do(changed)
+    assert str(files.kept) in str(caught.value)
+    assert files.evaluation.read_bytes() == before
+
+
 def test_what_an_earlier_version_did_not_keep_is_added(finished: GridConfig) -> None:
     files = finished.files(Path())
     (files.kept / "curve.csv").unlink()
