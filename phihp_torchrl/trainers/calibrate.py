@@ -16,14 +16,14 @@ from phihp_torchrl.planners import SearchConfig, score_sequences
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_contest import Contest
 from phihp_torchrl.trainers.calibrate_report import report, summary, warn_of_doubt, write_table
-from phihp_torchrl.trainers.calibrate_rule import Choice, choose, in_doubt
+from phihp_torchrl.trainers.calibrate_rule import RESTS, Choice, choose, in_doubt
 from phihp_torchrl.trainers.calibrate_ways import calmer, leaving
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, register_phase
 
-# An actor rests that has at most this chatter in the second halves of its episodes, where plans
-# promise at most the reward of so many steps beyond it.
-_RESTS, _LITTLE = 0.02, 3.0
+# Where plans promise at most the reward of so many steps beyond an actor that rests, it is left
+# alone there.
+_LITTLE = 3.0
 # States of the actor's second halves, for each episode, at which plans say what they promise.
 _PROMISES = 8
 _PROMISE_SHARE = 0.95
@@ -34,9 +34,9 @@ class CalibratePhase:
 
     A few ways to plan and the actor play whole episodes of the model from the same starts, with the
     same noise, and a rule (:func:`~phihp_torchrl.trainers.calibrate_rule.choose`) chooses. Where
-    the actor rests in the end, and plans promise little beyond it, the ways are plans that leave it
-    alone there; else there are the settings as given and calmer ones. More episodes are played
-    while it is in doubt who is to act. No real step is taken.
+    the actor rests in the end, there are plans that leave it alone there, and they are all that
+    there is if plans promise little beyond it; else there are the settings as given and calmer
+    ones. More episodes are played while it is in doubt who is to act. No real step is taken.
 
     Where other models that fit the data about as well say that the actor earns something else, the
     settings stay as given and the plan acts unless it is certain to earn less, and a warning says
@@ -166,10 +166,11 @@ class CalibratePhase:
             return {"given": {}}
         reward = (played.total / played.lengths).abs().mean().item()
         promise = self._promise(self.contest.late_states(_PROMISES))
-        alone = leaving(self.base, promise, reward)
-        if alone and played.chatter().mean() <= _RESTS and promise <= _LITTLE * reward:
+        rests = played.chatter().mean() <= RESTS
+        alone = leaving(self.base, promise, reward) if rests else {}
+        if alone and promise <= _LITTLE * reward:
             return alone
-        return {"given": {}, **calmer(self.base, reward)}
+        return {"given": {}, **alone, **calmer(self.base, reward)}
 
     @torch.no_grad()
     def _promise(self, state: Tensor) -> float:
@@ -200,7 +201,7 @@ class CalibratePhase:
         confidence = self.config.confidence
         choice = choose(ways, actor, confidence=confidence, doubted=self.doubted)
         plan, first = ways[choice.name], next(iter(ways))
-        rests = choice.certain and choice.gain >= 0.0 and plan.mean_chatter <= _RESTS
+        rests = choice.certain and choice.gain >= 0.0 and plan.mean_chatter <= RESTS
         if rests or choice.name != first:  # this is smooth already, or the calmest that is taken
             contest.close()
         if contest.next_way is None and (choice.certain or not contest.double()):

@@ -11,8 +11,11 @@ import torch
 
 # Of the plan's gain over the actor, what smoothness may cost.
 _SHARE = 0.1
-# And of the actor's return, if that is more: it is less than anybody would notice.
-_TRIFLE = 3e-3
+# And of the return, if that is more: it is less than anybody would notice. A plan that rests
+# where the other does not is worth a little more.
+_TRIFLE, _REST = 3e-3, 1e-2
+RESTS = 0.02
+"""Chatter, in half-ranges, at which one rests."""
 # Returns in two models differ by more than this share of them: more than smoothness may cost.
 _ALIKE = 0.02
 # Chatter of the smoother plan, as a share of the other's; and the least difference of the two.
@@ -96,8 +99,8 @@ def choose(
 
     Of those that are clearly smoother than what stays, with at most two thirds of its chatter, the
     smoothest takes its place that does not earn less, by over one standard error, than what
-    smoothness may cost: a tenth of the gain over the actor, or 0.3 % of the actor's return. The
-    benefit of doubt ends where the loss looks twice as large as that.
+    smoothness may cost: a tenth of the gain over the actor, or 0.3 % of the actor's return, or 1 %
+    for one that rests in the end. The benefit of doubt ends where the loss looks twice as large.
 
     The plan that is chosen acts if it earns more than the actor, or less, but not by over one
     standard error: a plan looks further than its actor and is compared with it at every step, so
@@ -133,11 +136,10 @@ def choose(
         if ahead > confidence * error or (behind[name] and not behind[other]):
             name = other
     best = ways[name]
-    allowed = max(_SHARE * best.ahead_of(actor)[0], _TRIFLE * abs(actor.mean_return))
     calm = {
         other: way.mean_chatter
         for other, way in ways.items()
-        if way.smoother_than(best) and _costs_at_most(allowed, way, best)
+        if way.smoother_than(best) and _costs_at_most(_allowed(way, best, actor), way, best)
     }
     name = min(calm, key=calm.__getitem__, default=name)
     plan = ways[name]
@@ -174,6 +176,12 @@ def in_doubt(own: Way, others: Sequence[Way], *, confidence: float = 2.0) -> boo
     gaps = (other.ahead_of(own) for other in others)
     least = _ALIKE * abs(own.mean_return)
     return any(abs(gap) > max(least, confidence * error) for gap, error in gaps)
+
+
+def _allowed(way: Way, best: Way, actor: Way) -> float:
+    """What the smoothness of a way may cost."""
+    trifle = _REST if way.mean_chatter <= RESTS < best.mean_chatter else _TRIFLE
+    return max(_SHARE * best.ahead_of(actor)[0], trifle * abs(actor.mean_return))
 
 
 def _costs_at_most(allowed: float, way: Way, best: Way) -> bool:

@@ -39,7 +39,7 @@ TINY = CalibrateConfig(enabled=True, episodes=3, max_episodes=6)
 @pytest.fixture
 def restless(monkeypatch):
     """No actor is taken to rest."""
-    monkeypatch.setattr(calibrate_module, "_RESTS", -1.0)
+    monkeypatch.setattr(calibrate_module, "RESTS", -1.0)
 
 
 def make_agent(name="brief-pendulum", planner=SMALL):

@@ -89,6 +89,14 @@ def test_of_several_calm_ones_the_calmest_that_costs_little_is_chosen() -> None:
     assert pick(GIVEN, dear, cheap, calm).name == "3"
 
 
+def test_one_that_rests_may_cost_a_little_more() -> None:
+    actor = way(*(-1000.0,) * 4, chatter=0.0)
+    given = way(*(-990.0,) * 4, chatter=0.5)
+    assert pick(given, way(*(-995.0,) * 4, chatter=0.01), actor=actor).name == "1"
+    assert pick(given, way(*(-995.0,) * 4, chatter=0.1), actor=actor).name == "0"
+    assert pick(given, way(*(-1025.0,) * 4, chatter=0.01), actor=actor).name == "0"
+
+
 def test_what_is_better_is_what_the_calm_ones_are_measured_by() -> None:
     better, calm = way(19.0, 21.0, 19.0, 21.5), way(12.0, 14.0, 12.0, 14.0, chatter=0.0)
     assert pick(GIVEN, calm).name == pick(GIVEN, better).name == "1"
