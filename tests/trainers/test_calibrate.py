@@ -233,6 +233,15 @@ def test_an_actor_that_rests_is_left_alone():
     assert phase.planner_config.actor_margin > 0.0
 
 
+def test_where_plans_promise_much_beyond_an_actor_that_rests_all_ways_may_play(monkeypatch):
+    monkeypatch.setattr(calibrate_module, "_LITTLE", 0.0)
+    taken = Choice("given", "planner", True, 1.0, 0.1)
+    monkeypatch.setattr(calibrate_module, "choose", lambda *_, **__: taken)
+    ways = list(finished(make_agent()).final["ways"])
+    assert ways[:3] == ["given", "leaving", "priced"]
+    assert "calm" in ways
+
+
 def test_where_models_disagree_the_settings_stay_as_given(caplog):
     """The other model's pendulum is much lighter."""
     agent = make_agent()
