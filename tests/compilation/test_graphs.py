@@ -78,6 +78,7 @@ os.environ["TORCHINDUCTOR_CACHE_DIR"] = {cache!r}
 import torch
 from phihp_torchrl.compilation import compile_graph
 torch._inductor.config.cpp_cache_precompile_headers = False
+torch._inductor.config.cpp.vec_isa_ok = True
 fork = multiprocessing.get_context("fork")
 together = fork.Barrier(2)
 

@@ -200,6 +200,7 @@ def test_an_agent_stays_eager_where_the_other_process_fails(monkeypatch, caplog)
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_another_process_compiles_the_plan():
+    """By Inductor; other tests of compiled plans take a backend that is quicker at it."""
     agent = make(planner_config=SMALLEST)
     expected = act(agent)
     found = agent.warm_up(background=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 
-import pytest
 import torch
 from points import ZEROS, point_problem
 from tensordict import TensorDict
@@ -55,21 +54,6 @@ def test_compiled_equals_eager():
         tensordict = TensorDict(observation=task.observe(state), batch_size=[3])
         noise = noise_for(eager, (3,), seed)
         torch.testing.assert_close(*(p.plan(tensordict, noise) for p in (eager, compiled)))
-
-
-@pytest.mark.slow
-def test_compiled_by_inductor_equals_eager():
-    """The search; rollouts, whose models are learned and have actors, have a test of their own."""
-    torch._dynamo.reset()
-    task, _, actor, _ = task_parts("pendulum")
-    env = WorldModelEnv(SimulatedWorld(task).model())
-    observation = task.observe(task.coverage.sample([]))
-    tensordict = TensorDict(observation=observation)
-    small = {"planning_horizon": 2, "optim_steps": 1}  # machine code for more takes a minute
-    eager, compiled = (make_planner(env, actor, **small, compile=c) for c in (False, True))
-    noise = noise_for(eager)
-    actions = [planner.planning(tensordict, noise) for planner in (eager, compiled)]
-    torch.testing.assert_close(*actions, atol=1e-4, rtol=1e-4)
 
 
 def test_what_cannot_compile_says_so(caplog):
