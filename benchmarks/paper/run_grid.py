@@ -3,9 +3,9 @@
     python benchmarks/paper/run_grid.py method=phihp task=pendulum,acrobot seed=0,1,2 share=1,0.1
     python benchmarks/paper/run_grid.py task=pendulum,acrobot seed=range(5) launcher=joblib jobs=2
 
-A finished cell is skipped, one that was cut off goes on from its checkpoint, one that failed is
-reported. ``config/grid.yaml`` has more examples, and every key; ``make_report.py`` makes tables and
-figures of what is kept in results/runs/.
+A finished cell is skipped, and refused if its settings are not those of now; one that was cut off
+goes on from its checkpoint, one that failed is reported. ``config/grid.yaml`` has more examples,
+and every key; ``make_report.py`` makes tables and figures of what is kept in results/runs/.
 """
 
 from __future__ import annotations

@@ -9,9 +9,10 @@ some milliseconds, when a graph that has it is compiled. The compiler's cache ke
 from __future__ import annotations
 
 import functools
+import platform
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, fx
@@ -44,49 +45,62 @@ def _linear(input: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> T
     return torch.ops.mkldnn._linear_pointwise.default(input, weight, bias, attribute, [], "")
 
 
-def by_onednn(input: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
-    """``input @ weight.T + bias`` with an optional ReLU, by oneDNN on the CPU."""
-    return torch.ops.phihp_torchrl.linear.default(input, weight, bias, relu)
+class Product(NamedTuple):
+    """A product of two matrices as it stands in a graph.
 
-
-def by_blas(input: Tensor, weight: Tensor, bias: Tensor | None, relu: bool) -> Tensor:
-    """The same by ATen, which asks its BLAS."""
-    product = torch.nn.functional.linear(input, weight, bias)
-    return product.relu_() if relu else product
-
-
-@functools.cache
-def onednn_is_faster(
-    rows: int, inner: int, columns: int, dtype: torch.dtype, bias: bool, relu: bool
-) -> bool:
-    """Whether oneDNN is the faster one for ``[rows, inner] @ [inner, columns]``, by a measurement.
-
-    Args:
-        rows: rows of the first matrix.
-        inner: its columns.
-        columns: columns of the second matrix.
+    Attributes:
+        left: sizes and strides of the first matrix.
+        right: of the second one.
         dtype: of both.
         bias: whether a bias is added.
         relu: whether a ReLU follows.
+        turned: whether its transpose is what is used.
+    """
+
+    left: tuple[tuple[int, ...], tuple[int, ...]]
+    right: tuple[tuple[int, ...], tuple[int, ...]]
+    dtype: torch.dtype
+    bias: bool = False
+    relu: bool = False
+    turned: bool = False
+
+
+def by_onednn(a: Tensor, b: Tensor, bias: Tensor | None, product: Product) -> Tensor:
+    """``a @ b + bias``, or its transpose, with an optional ReLU, by oneDNN on the CPU."""
+    linear = torch.ops.phihp_torchrl.linear.default
+    return linear(b.t(), a, None, False) if product.turned else linear(a, b.t(), bias, product.relu)
+
+
+def by_blas(a: Tensor, b: Tensor, bias: Tensor | None, product: Product) -> Tensor:
+    """The same, not transposed, by ATen, which asks its BLAS."""
+    found = torch.mm(a, b) if bias is None else torch.addmm(bias, a, b)
+    return found.relu_() if product.relu else found
+
+
+@functools.cache
+def onednn_is_faster(product: Product, threads: int) -> bool:
+    """Whether oneDNN is the faster one for a product, by a measurement on this machine's CPU.
+
+    Args:
+        product: the product, in the layout in which it is computed.
+        threads: threads of an operation, ``torch.get_num_threads()``.
 
     Returns:
         Whether its fastest call took at most 95 % of the BLAS's. A second call with the same
         arguments does not measure again.
 
     Examples:
-        >>> onednn_is_faster(64, 300, 300, torch.float32, True, True) in (True, False)
+        >>> product = Product(((64, 300), (300, 1)), ((300, 300), (1, 300)), torch.float32)
+        >>> onednn_is_faster(product, torch.get_num_threads()) in (True, False)
         True
     """
     with unset_fake_temporarily(), torch.inference_mode():
-        input, weight = (
-            torch.ones(rows, inner, dtype=dtype),
-            torch.ones(columns, inner, dtype=dtype),
+        a, b = (
+            torch.empty_strided(*layout, dtype=product.dtype, device="cpu").fill_(1.0)
+            for layout in (product.left, product.right)
         )
-        added = torch.ones(columns, dtype=dtype) if bias else None
-        blas, onednn = (
-            functools.partial(product, input, weight, added, relu)
-            for product in (by_blas, by_onednn)
-        )
+        bias = torch.ones(b.shape[1], dtype=product.dtype, device="cpu") if product.bias else None
+        blas, onednn = (functools.partial(by, a, b, bias, product) for by in (by_blas, by_onednn))
         pairs = [(_seconds(blas), _seconds(onednn)) for _ in range(_ROUNDS)]
     theirs, ours = (min(times) for times in zip(*pairs, strict=True))
     return ours <= _SHARE * theirs
@@ -111,7 +125,9 @@ class FasterProducts(CustomGraphPass):
             # The gradient of a weight is computed in the transposed form in which it is used.
             turned = not added and bool(users) and all(map(_is_transposition, users))
             relu = not turned and len(users) == 1 and users[0].target is _aten.relu.default
-            if not onednn_is_faster(*_sizes(node), a.meta["val"].dtype, bool(added), relu):
+            layouts = (_layout(a), _layout(b))
+            asked = Product(*layouts, a.meta["val"].dtype, bool(added), relu, turned)
+            if not onednn_is_faster(asked, torch.get_num_threads()):
                 continue
             with graph.inserting_before(node):
                 if turned:
@@ -127,14 +143,16 @@ class FasterProducts(CustomGraphPass):
                 graph.erase_node(node)
 
     def uuid(self) -> bytes:
-        return get_hash_for_files((__file__,))
+        # What was measured holds for such a machine, and so does a graph in the compiler's cache.
+        machine = platform.processor(), torch.backends.cpu.get_cpu_capability()
+        return get_hash_for_files((__file__,), f"{machine} {torch.get_num_threads()}")
 
 
 def _is_eligible(node: Any) -> bool:
     if node.op != "call_function" or node.target not in (_aten.mm.default, _aten.addmm.default):
         return False
-    *added, a, _ = [argument.meta["val"] for argument in node.args]
-    rows, inner, columns = _sizes(node)
+    *added, a, b = [argument.meta["val"] for argument in node.args]
+    rows, inner, columns = a.shape[0], a.shape[1], b.shape[1]
     return (
         torch.backends.mkldnn.is_available()
         and a.device.type == "cpu"
@@ -147,10 +165,10 @@ def _is_eligible(node: Any) -> bool:
     )
 
 
-def _sizes(node: Any) -> tuple[Any, Any, Any]:
-    """Rows, inner size and columns of a product."""
-    a, b = (argument.meta["val"] for argument in node.args[-2:])
-    return a.shape[0], a.shape[1], b.shape[1]
+def _layout(node: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Sizes and strides of a matrix."""
+    matrix = node.meta["val"]
+    return tuple(matrix.shape), tuple(matrix.stride())
 
 
 def _dtypes() -> tuple[torch.dtype, ...]:

@@ -17,7 +17,7 @@ from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_contest import Contest
 from phihp_torchrl.trainers.calibrate_report import report, summary, warn_of_doubt, write_table
 from phihp_torchrl.trainers.calibrate_rule import RESTS, Choice, choose, in_doubt
-from phihp_torchrl.trainers.calibrate_ways import calmer, leaving
+from phihp_torchrl.trainers.calibrate_ways import LEAVING, calmer, leaving
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, register_phase
 
@@ -202,7 +202,8 @@ class CalibratePhase:
         choice = choose(ways, actor, confidence=confidence, doubted=self.doubted)
         plan, first = ways[choice.name], next(iter(ways))
         rests = choice.certain and choice.gain >= 0.0 and plan.mean_chatter <= RESTS
-        if rests or choice.name != first:  # this is smooth already, or the calmest that is taken
+        calm = choice.name not in (first, *LEAVING)
+        if rests or calm:  # this is smooth already, or the calmest that is taken
             contest.close()
         if contest.next_way is None and (choice.certain or not contest.double()):
             models = {"models_disagree": self.doubted, "actor_elsewhere": self.elsewhere}

@@ -101,6 +101,7 @@ def choose(
     smoothest takes its place that does not earn less, by over one standard error, than what
     smoothness may cost: a tenth of the gain over the actor, or 0.3 % of the actor's return, or 1 %
     for one that rests in the end. The benefit of doubt ends where the loss looks twice as large.
+    None does that falls behind the actor, by over one standard error, unless that is smoother too.
 
     The plan that is chosen acts if it earns more than the actor, or less, but not by over one
     standard error: a plan looks further than its actor and is compared with it at every step, so
@@ -139,7 +140,9 @@ def choose(
     calm = {
         other: way.mean_chatter
         for other, way in ways.items()
-        if way.smoother_than(best) and _costs_at_most(_allowed(way, best, actor), way, best)
+        if way.smoother_than(best)
+        and _costs_at_most(_allowed(way, best, actor), way, best)
+        and (behind[name] or not behind[other] or actor.smoother_than(best))
     }
     name = min(calm, key=calm.__getitem__, default=name)
     plan = ways[name]

@@ -8,6 +8,9 @@ from typing import Any
 
 from phihp_torchrl.planners import SearchConfig
 
+LEAVING = ("leaving", "priced")
+"""The ways that leave an actor alone where it rests."""
+
 # Share of a step's reward below which a promise is rounding.
 _NOTHING = 1e-3
 # A search that goes on from the previous plan, and keeps it unless another is better.
@@ -48,7 +51,7 @@ def leaving(config: SearchConfig, promise: float, reward: float) -> dict[str, di
 
 
 def calmer(config: SearchConfig, reward: float) -> dict[str, dict[str, Any]]:
-    """Three ways to plan calmly, by name, the calmest first, for an actor that does not rest.
+    """Three ways to plan calmly, by name, the calmest first.
 
     A price of changes alone leaves the noise of the search: the mean of a few elites of a wide
     Gaussian. So these go on from the previous plan, keep it unless another is better, and look for

@@ -11,7 +11,7 @@ from phihp_torchrl.planners import CEMConfig, Problem, cem_plan
 from phihp_torchrl.tasks import ActionBounds
 
 SEARCH = CEMConfig(num_candidates=32, num_policy_candidates=8, top_k=4)
-"""The search of these plans, of half as many candidates as an agent's; it has the critics' γ."""
+"""The search of these plans, with fewer candidates than an agent's; it has the critics' γ."""
 _PLANS_FALL, PLANS_END = 0.25, 0.5
 """Shares of the updates from which on plans give way to the actor, and after which none act."""
 

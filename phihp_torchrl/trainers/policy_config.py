@@ -69,9 +69,9 @@ class PolicyConfig:
         constants_std: standard deviation that takes the place of the fit's: of a free constant
             relative, of a bounded one of the logit of its place; null for the fit's.
         strategies: what is tried where imagined returns stay at the floor: auto for all strategies
-            in turn, none, or a list of names, of goal (starts where the reward is met), further
-            (longer horizons), wide, backwards (other starts) and analytic (gradients through the
-            model).
+            in turn, none, or a list of names, of goal (starts where the reward is met), analytic
+            (gradients through the model), further (longer horizons), wide and backwards (other
+            starts).
         start: where imagined episodes start.
         td3: hyper-parameters of TD3; all methods have its networks and γ.
         analytic: hyper-parameters of policy gradients through the model.

@@ -10,7 +10,12 @@ from torch._inductor.utils import run_and_get_code
 from torch.nn import functional as F
 
 from phihp_torchrl.compilation import compile_graph, matrix_products
-from phihp_torchrl.compilation.matrix_products import onednn_is_faster
+from phihp_torchrl.compilation.matrix_products import (
+    Product,
+    by_blas,
+    by_onednn,
+    onednn_is_faster,
+)
 
 LARGE, SMALL = 192, 8  # a product of three LARGE sides may go to oneDNN
 CALL = "phihp_torchrl.linear.default("
@@ -88,27 +93,61 @@ def test_the_blas_keeps_what_it_does_faster(chosen):
     check(lambda *t: F.linear(*t).relu(), x, weight, bias, calls=0)
 
 
+SQUARE = (LARGE, LARGE), (LARGE, 1)
+ONE = Product(SQUARE, SQUARE, torch.float32)
+
+
 @pytest.mark.parametrize(("slower", "faster"), [("by_blas", True), ("by_onednn", False)])
 def test_a_choice_is_measured_once(monkeypatch, slower, faster):
     measured = []
 
-    def product(input, weight, bias, relu):
-        measured.append(input.shape)
-        return input
+    def multiply(a, b, bias, product):
+        measured.append(product)
+        return a
 
     def slow(*arguments):
         time.sleep(0.01)
-        return product(*arguments)
+        return multiply(*arguments)
 
     for name in ("by_blas", "by_onednn"):
-        monkeypatch.setattr(matrix_products, name, slow if name == slower else product)
+        monkeypatch.setattr(matrix_products, name, slow if name == slower else multiply)
     onednn_is_faster.cache_clear()
-    arguments = 8, 4, 2, torch.float32, True, False
-    assert onednn_is_faster(*arguments) is faster
+    assert onednn_is_faster(ONE, 1) is faster
     count = len(measured)
-    assert onednn_is_faster(*arguments) is faster
+    assert onednn_is_faster(ONE, 1) is faster
     assert len(measured) == count > 0
     onednn_is_faster.cache_clear()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("layout", [(LARGE, 1), (1, LARGE)])
+def test_both_libraries_give_the_same(layout, turned):
+    a, b = (torch.randn(LARGE, LARGE).as_strided((LARGE, LARGE), layout) for _ in range(2))
+    product = ONE._replace(turned=turned)
+    expected, found = by_blas(a, b, None, product), by_onednn(a, b, None, product)
+    torch.testing.assert_close(found, expected.t() if turned else expected, atol=1e-4, rtol=1e-4)
+    if not turned:
+        added, product = torch.randn(LARGE), product._replace(bias=True, relu=True)
+        both = by_blas(a, b, added, product), by_onednn(a, b, added, product)
+        torch.testing.assert_close(*both, atol=1e-4, rtol=1e-4)
+        assert both[0].min() == 0.0
+
+
+def test_a_gradient_of_a_weight_is_measured_as_it_runs(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        matrix_products, "onednn_is_faster", lambda product, _: asked.append(product) or True
+    )
+    x, weight = torch.randn(LARGE, LARGE) / 10, torch.randn(LARGE, LARGE) / 10
+
+    def loss(weight, x):
+        return F.linear(x, weight).square().mean()
+
+    compile_graph(torch.func.grad(loss))(weight, x)
+    forward, gradient = asked
+    assert (forward.left[1], forward.right[1]) == ((LARGE, 1), (1, LARGE))
+    assert (1, LARGE) in (gradient.left[1], gradient.right[1])
+    assert forward != gradient
 
 
 def test_a_graph_has_what_was_measured(monkeypatch):
@@ -117,6 +156,6 @@ def test_a_graph_has_what_was_measured(monkeypatch):
     x = torch.randn(LARGE, LARGE)
     _, code = run_and_get_code(compile_graph(torch.mm), x, x)  # measures while it compiles
     assert onednn_is_faster.cache_info().misses == 1
-    chosen = onednn_is_faster(LARGE, LARGE, LARGE, torch.float32, False, False)
+    chosen = onednn_is_faster(ONE, torch.get_num_threads())
     assert onednn_is_faster.cache_info().misses == 1
     assert (CALL in code[0]) is chosen

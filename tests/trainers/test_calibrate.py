@@ -233,10 +233,13 @@ def test_an_actor_that_rests_is_left_alone():
     assert phase.planner_config.actor_margin > 0.0
 
 
-def test_where_plans_promise_much_beyond_an_actor_that_rests_all_ways_may_play(monkeypatch):
+@pytest.mark.parametrize("taken", ["given", "leaving"])
+def test_where_plans_promise_much_beyond_an_actor_that_rests_all_ways_may_play(monkeypatch, taken):
+    def choose(ways, actor, **_):
+        return Choice(taken if taken in ways else "given", "planner", False, 1.0, 0.6)
+
     monkeypatch.setattr(calibrate_module, "_LITTLE", 0.0)
-    taken = Choice("given", "planner", True, 1.0, 0.1)
-    monkeypatch.setattr(calibrate_module, "choose", lambda *_, **__: taken)
+    monkeypatch.setattr(calibrate_module, "choose", choose)
     ways = list(finished(make_agent()).final["ways"])
     assert ways[:3] == ["given", "leaving", "priced"]
     assert "calm" in ways

@@ -97,6 +97,15 @@ def test_one_that_rests_may_cost_a_little_more() -> None:
     assert pick(given, way(*(-1025.0,) * 4, chatter=0.01), actor=actor).name == "0"
 
 
+def test_smoothness_does_not_hand_over_to_a_restless_actor() -> None:
+    actor, given, calm = (
+        way(*(earned,) * 4, chatter=chatter)
+        for earned, chatter in ((-1000.0, 0.4), (-995.0, 0.5), (-1004.0, 0.01))
+    )
+    choice = pick(given, calm, actor=actor)
+    assert (choice.name, choice.acting) == ("0", "planner")
+
+
 def test_what_is_better_is_what_the_calm_ones_are_measured_by() -> None:
     better, calm = way(19.0, 21.0, 19.0, 21.5), way(12.0, 14.0, 12.0, 14.0, chatter=0.0)
     assert pick(GIVEN, calm).name == pick(GIVEN, better).name == "1"

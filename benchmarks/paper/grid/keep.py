@@ -38,20 +38,22 @@ def keep(files: CellFiles) -> None:
         points = curve_from_metrics(csv.DictReader(file))
     write_curve(files.run / CURVE, points)
     _replace(files.run / CURVE, files.kept / CURVE)
-    settings = yaml.safe_load((files.run / "config.yaml").read_text())
-    cell = {**asdict(files.cell), "configuration": configuration_hash(settings)}
+    cell = {**asdict(files.cell), "configuration": fingerprint(files.run)}
     (files.run / CELL).write_text(json.dumps(cell, indent=2) + "\n")
     _replace(files.run / CELL, files.kept / CELL)
     _keep_prediction(files)
     _replace(files.run / "evaluation.json", files.evaluation)
 
 
-def read_configuration(files: CellFiles) -> str | None:
-    """The fingerprint of the settings of a finished run; none where an earlier version kept it."""
-    if not (files.kept / CELL).is_file():
-        return None
-    found: str | None = json.loads((files.kept / CELL).read_text()).get("configuration")
-    return found
+def fingerprint(folder: Path) -> str:
+    """That of the settings of a run, or of what is kept of it."""
+    return configuration_hash(yaml.safe_load((folder / "config.yaml").read_text()))
+
+
+def has_fingerprint(files: CellFiles) -> bool:
+    """Whether the version that kept a cell wrote the fingerprint of its settings."""
+    cell = files.kept / CELL
+    return cell.is_file() and "configuration" in json.loads(cell.read_text())
 
 
 def is_whole(files: CellFiles) -> bool:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra.core.global_hydra import GlobalHydra
@@ -18,7 +19,7 @@ from hydra.core.global_hydra import GlobalHydra
 from grid.cell import CellFiles
 from grid.claim import claim
 from grid.config import GridConfig
-from grid.keep import is_whole, keep, read_configuration
+from grid.keep import fingerprint, has_fingerprint, is_whole, keep
 from grid.status import CellState, Status, is_done, look
 from measures import configuration_hash
 from phihp_torchrl.config import ConfigError, compose_yaml, override_lines
@@ -51,7 +52,7 @@ def work(config: GridConfig, root: Path) -> CellState:
         )
     files = config.files(root)
     if look(files).status is Status.DONE and is_whole(files):
-        _check_settings(config, files)
+        _check_kept(config, files)
         return look(files)
     with claim(files.lock, config.claim_wait) as ours:
         # Only now: another process may have finished the cell, or failed at it, meanwhile.
@@ -61,20 +62,43 @@ def work(config: GridConfig, root: Path) -> CellState:
         elif ours and (config.retry_failed or not files.failure.is_file()):
             with _logged(files.log):
                 _run(config, files)
-    return look(files)
+    state = look(files)
+    if state.status is Status.DONE:
+        _check_kept(config, files)
+    return state
 
 
-def _check_settings(config: GridConfig, files: CellFiles) -> None:
-    """Refuse a finished cell whose settings the same words no longer give."""
-    kept = read_configuration(files)
-    settings = _request(config, files).config.to_mapping()
-    if kept is not None and kept != configuration_hash(settings):
+def _check_kept(config: GridConfig, files: CellFiles) -> None:
+    """Refuse a finished cell whose settings the same words no longer give.
+
+    One that a version kept which wrote no fingerprint is taken as it is.
+    """
+    kept, now = fingerprint(files.kept), configuration_hash(_settings(config))
+    if kept != now and has_fingerprint(files):
         raise ConfigError(
             "results",
-            f"expected cells of the present settings, but {files.kept} is of others "
-            f"({kept}, now {configuration_hash(settings)}): keep the cells of a new default in "
-            "another directory, or move that one away.",
+            f"expected cells of the present settings ({now}), but {files.kept} is of others "
+            f"({kept}). Give the grid another `results` and another `runs`, or move the cell and "
+            f"{files.run} away.",
         )
+
+
+def _check_run(config: GridConfig, files: CellFiles) -> None:
+    """Refuse a finished run of other settings, whose numbers would be kept as this cell's."""
+    then, now = fingerprint(files.run), configuration_hash(_settings(config))
+    if then != now:
+        raise ConfigError(
+            "runs",
+            f"expected runs of the present settings ({now}), but {files.run} is of others "
+            f"({then}). Give the grid another `runs`, or move that one away.",
+        )
+
+
+def _settings(config: GridConfig) -> dict[str, Any]:
+    """The settings of a cell that begins now."""
+    words = list(config.words())
+    with _no_hydra():
+        return read_request(compose_yaml(words), words).config.to_mapping()
 
 
 def _run(config: GridConfig, files: CellFiles) -> None:
@@ -86,6 +110,7 @@ def _run(config: GridConfig, files: CellFiles) -> None:
         _log.info("%s", "resumed" if request.resume else "started")
         result = run(request.config, request.path, resume=request.resume)
         if result.finished:
+            _check_run(config, files)
             keep(files)
             _log.info("finished")
     except Exception as error:

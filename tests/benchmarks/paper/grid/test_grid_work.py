@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -104,15 +105,38 @@ def test_other_methods_leave_what_a_report_reads(
     assert "p50" in run.acting[acting].latency
 
 
+def of_other_settings(config: GridConfig) -> None:
+    """Let a finished cell and its run be of another default, which the words do not name."""
+    files = config.files(Path())
+    for folder in (files.run, files.kept):
+        text = (folder / "config.yaml").read_text()
+        assert "patience: 0.4\n" in text
+        (folder / "config.yaml").write_text(text.replace("patience: 0.4\n", "patience: 0.5\n"))
+
+
 def test_a_finished_cell_of_other_settings_is_refused(finished: GridConfig) -> None:
-    changed = replace(finished, overrides=(*finished.overrides, "policy.updates=12"))
     files = finished.files(Path())
     before = files.evaluation.read_bytes()
     assert do(finished).status is Status.DONE  # the same
+    of_other_settings(finished)
+    shutil.rmtree(files.run / "phases")  # what takes room
+    shutil.rmtree(files.run / "checkpoints")
     with pytest.raises(ConfigError, match="cells of the present settings") as caught:
-        do(changed)
+        do(finished)
     assert str(files.kept) in str(caught.value)
     assert files.evaluation.read_bytes() == before
+    assert (files.run / "agent").is_dir()
+
+
+def test_a_run_of_other_settings_is_not_kept_as_a_cell(
+    finished: GridConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("grid.worker._settings", lambda config: {"another": "default"})
+    elsewhere = replace(finished, results="elsewhere")
+    state = do(elsewhere)
+    assert state.status is Status.FAILED
+    assert "runs of the present settings" in state.detail
+    assert not elsewhere.files(Path()).evaluation.exists()
 
 
 def test_what_an_earlier_version_did_not_keep_is_added(finished: GridConfig) -> None:
@@ -231,7 +255,8 @@ def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
     os.kill(process, signal.SIGKILL)
     assert forks.wait() == -signal.SIGKILL
     assert look(config.files(Path())).status is Status.STOPPED
-    assert do(replace(config, claim_wait=10.0)).status is Status.DONE
+    again = replace(config, claim_wait=10.0, overrides=tuple(overrides))
+    assert do(again).status is Status.DONE
     assert words(config) == ["started", "resumed", "finished"]
     assert returns(config) == returns(whole)
     with (config.files(Path()).kept / "metrics.csv").open() as file:
