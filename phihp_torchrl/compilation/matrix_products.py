@@ -1,9 +1,9 @@
 """Matrix products of compiled graphs, each by the faster of two libraries on the machine at hand.
 
 On a CPU, ATen hands products of float32 matrices to its BLAS. With 64 to thousands of rows and
-layers of 100 to 300 units, which are the sizes met here, oneDNN is faster on some processors, by up
-to half, and slower on others by as much. So each size of product is timed once by both, which takes
-some milliseconds, when a graph that has it is compiled. The compiler's cache keeps what was chosen.
+layers of 100 to 300 units, which are the sizes met here, oneDNN is faster on some processors and
+slower on others. So each product is timed once by both, which takes some milliseconds, when a graph
+that has it is compiled. The compiler's cache keeps what was chosen.
 """
 
 from __future__ import annotations

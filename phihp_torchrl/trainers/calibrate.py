@@ -34,9 +34,10 @@ class CalibratePhase:
 
     A few ways to plan and the actor play whole episodes of the model from the same starts, with the
     same noise, and a rule (:func:`~phihp_torchrl.trainers.calibrate_rule.choose`) chooses. Where
-    the actor rests in the end, there are plans that leave it alone there, and they are all that
-    there is if plans promise little beyond it; else there are the settings as given and calmer
-    ones. More episodes are played while it is in doubt who is to act. No real step is taken.
+    the actor rests in the end and plans promise little beyond it, the ways are plans that leave it
+    alone there; else they are the settings as given and calmer ones, and those that leave it alone
+    too if it rests. More episodes are played while it is in doubt who is to act. No real step is
+    taken.
 
     Where other models that fit the data about as well say that the actor earns something else, the
     settings stay as given and the plan acts unless it is certain to earn less, and a warning says
@@ -165,11 +166,12 @@ class CalibratePhase:
             warn_of_doubt(own.mean_return, self.elsewhere)
             return {"given": {}}
         reward = (played.total / played.lengths).abs().mean().item()
-        promise = self._promise(self.contest.late_states(_PROMISES))
-        rests = played.chatter().mean() <= RESTS
-        alone = leaving(self.base, promise, reward) if rests else {}
-        if alone and promise <= _LITTLE * reward:
-            return alone
+        alone: dict[str, dict[str, Any]] = {}
+        if played.chatter().mean() <= RESTS:
+            promise = self._promise(self.contest.late_states(_PROMISES))
+            alone = leaving(self.base, promise, reward)
+            if alone and promise <= _LITTLE * reward:
+                return alone
         return {"given": {}, **alone, **calmer(self.base, reward)}
 
     @torch.no_grad()

@@ -106,11 +106,11 @@ def choose(
     The plan that is chosen acts if it earns more than the actor, or less, but not by over one
     standard error: a plan looks further than its actor and is compared with it at every step, so
     what is in doubt is more likely a gain. Where the actor is clearly smoother, the plan acts only
-    if it earns more by over one standard error. Where
-    both earn exactly the same in each episode, the actor, which is cheaper, acts, unless the plan
-    is clearly smoother. Beyond ``confidence`` standard errors, on either side, the choice is
-    certain; all else is doubtful and deserves more episodes. Those are a second look at the same
-    question, which a bound of two standard errors passes a little more often than one look would.
+    if it earns more by over one standard error. Where both earn exactly the same in each episode,
+    the actor, which is cheaper, acts, unless the plan is clearly smoother. Beyond
+    ``confidence`` standard errors, on either side, the choice is certain; all else is doubtful and
+    deserves more episodes. Those are a second look at the same question, which a bound of two
+    standard errors passes a little more often than one look would.
 
     Where the model itself is doubted, the plan acts unless it is certain to earn less. It answers
     at every step to where the world has gone; the actor has learned in that model alone, in which
@@ -141,7 +141,7 @@ def choose(
         other: way.mean_chatter
         for other, way in ways.items()
         if way.smoother_than(best)
-        and _costs_at_most(_allowed(way, best, actor), way, best)
+        and _costs_little(way, best, actor)
         and (behind[name] or not behind[other] or actor.smoother_than(best))
     }
     name = min(calm, key=calm.__getitem__, default=name)
@@ -181,13 +181,10 @@ def in_doubt(own: Way, others: Sequence[Way], *, confidence: float = 2.0) -> boo
     return any(abs(gap) > max(least, confidence * error) for gap, error in gaps)
 
 
-def _allowed(way: Way, best: Way, actor: Way) -> float:
-    """What the smoothness of a way may cost."""
+def _costs_little(way: Way, best: Way, actor: Way) -> bool:
+    """Whether a way earns as much as the best, but for what its smoothness may cost."""
     trifle = _REST if way.mean_chatter <= RESTS < best.mean_chatter else _TRIFLE
-    return max(_SHARE * best.ahead_of(actor)[0], trifle * abs(actor.mean_return))
-
-
-def _costs_at_most(allowed: float, way: Way, best: Way) -> bool:
+    allowed = max(_SHARE * best.ahead_of(actor)[0], trifle * abs(actor.mean_return))
     ahead, error = way.ahead_of(best)
     return ahead >= -allowed - min(error, allowed)
 

@@ -31,10 +31,10 @@ def planned_share(done: float) -> float:
 class PlannedActs:
     """A policy of imagined worlds: plans act in the first of them, and the actor in the others.
 
-    The plans are sought as the agent's are, with the networks as they are.
-    They look ahead in the model where the actor can only repeat what it has learned. What they meet
-    goes into the replay like all else, and TD3 learns from it, whoever acted (guided policy search,
-    Levine and Koltun, 2013, has its demonstrations from a planner in the same way).
+    The plans are sought as the agent's are, with the networks as they are. They look ahead in the
+    model where the actor can only repeat what it has learned. What they meet goes into the replay
+    like all else, and TD3 learns from it, whoever acted (guided policy search, Levine and Koltun,
+    2013, has its demonstrations from a planner in the same way).
 
     Args:
         world_model: the model by which to plan, in the units of the networks.

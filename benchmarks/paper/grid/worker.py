@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import torch
 from hydra.core.global_hydra import GlobalHydra
@@ -51,54 +50,32 @@ def work(config: GridConfig, root: Path) -> CellState:
             "expected a tree without uncommitted changes, or allow_dirty=true for a trial.",
         )
     files = config.files(root)
-    if look(files).status is Status.DONE and is_whole(files):
-        _check_kept(config, files)
-        return look(files)
-    with claim(files.lock, config.claim_wait) as ours:
-        # Only now: another process may have finished the cell, or failed at it, meanwhile.
-        if ours and is_done(files):
-            if not is_whole(files):
-                keep(files)
-        elif ours and (config.retry_failed or not files.failure.is_file()):
-            with _logged(files.log):
-                _run(config, files)
+    if not (is_done(files) and is_whole(files)):
+        with claim(files.lock, config.claim_wait) as ours:
+            # Only now: another process may have finished the cell, or failed at it, meanwhile.
+            if ours and is_done(files):
+                if not is_whole(files):
+                    keep(files)
+            elif ours and (config.retry_failed or not files.failure.is_file()):
+                with _logged(files.log):
+                    _run(config, files)
     state = look(files)
-    if state.status is Status.DONE:
-        _check_kept(config, files)
+    # A cell whose settings an earlier version did not fingerprint is taken as it is.
+    if state.status is Status.DONE and has_fingerprint(files):
+        _check_settings(config, files.kept)
     return state
 
 
-def _check_kept(config: GridConfig, files: CellFiles) -> None:
-    """Refuse a finished cell whose settings the same words no longer give.
-
-    One that a version kept which wrote no fingerprint is taken as it is.
-    """
-    kept, now = fingerprint(files.kept), configuration_hash(_settings(config))
-    if kept != now and has_fingerprint(files):
-        raise ConfigError(
-            "results",
-            f"expected cells of the present settings ({now}), but {files.kept} is of others "
-            f"({kept}). Give the grid another `results` and another `runs`, or move the cell and "
-            f"{files.run} away.",
-        )
-
-
-def _check_run(config: GridConfig, files: CellFiles) -> None:
-    """Refuse a finished run of other settings, whose numbers would be kept as this cell's."""
-    then, now = fingerprint(files.run), configuration_hash(_settings(config))
+def _check_settings(config: GridConfig, folder: Path) -> None:
+    """Refuse a run, or what is kept of it, whose settings the same words no longer give."""
+    then = fingerprint(folder)
+    now = configuration_hash(_read(list(config.words())).config.to_mapping())
     if then != now:
         raise ConfigError(
-            "runs",
-            f"expected runs of the present settings ({now}), but {files.run} is of others "
-            f"({then}). Give the grid another `runs`, or move that one away.",
+            str(folder),
+            f"expected a run of the present settings ({now}), got one of others ({then}). Give "
+            "the grid another `results` and another `runs`, or move the cell and its run away.",
         )
-
-
-def _settings(config: GridConfig) -> dict[str, Any]:
-    """The settings of a cell that begins now."""
-    words = list(config.words())
-    with _no_hydra():
-        return read_request(compose_yaml(words), words).config.to_mapping()
 
 
 def _run(config: GridConfig, files: CellFiles) -> None:
@@ -110,7 +87,7 @@ def _run(config: GridConfig, files: CellFiles) -> None:
         _log.info("%s", "resumed" if request.resume else "started")
         result = run(request.config, request.path, resume=request.resume)
         if result.finished:
-            _check_run(config, files)
+            _check_settings(config, files.run)  # else its numbers would be kept as this cell's
             keep(files)
             _log.info("finished")
     except Exception as error:
@@ -140,6 +117,10 @@ def _request(config: GridConfig, files: CellFiles) -> RunRequest:
         shutil.rmtree(files.run, ignore_errors=True)
         place = "run_dir"
     words = [*config.words(), *override_lines({place: str(files.run)})]
+    return _read(words)
+
+
+def _read(words: list[str]) -> RunRequest:
     with _no_hydra():
         return read_request(compose_yaml(words), words)
 

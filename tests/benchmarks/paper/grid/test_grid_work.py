@@ -121,7 +121,7 @@ def test_a_finished_cell_of_other_settings_is_refused(finished: GridConfig) -> N
     of_other_settings(finished)
     shutil.rmtree(files.run / "phases")  # what takes room
     shutil.rmtree(files.run / "checkpoints")
-    with pytest.raises(ConfigError, match="cells of the present settings") as caught:
+    with pytest.raises(ConfigError, match="run of the present settings") as caught:
         do(finished)
     assert str(files.kept) in str(caught.value)
     assert files.evaluation.read_bytes() == before
@@ -131,11 +131,11 @@ def test_a_finished_cell_of_other_settings_is_refused(finished: GridConfig) -> N
 def test_a_run_of_other_settings_is_not_kept_as_a_cell(
     finished: GridConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("grid.worker._settings", lambda config: {"another": "default"})
+    monkeypatch.setattr("grid.worker.configuration_hash", lambda settings: "another default")
     elsewhere = replace(finished, results="elsewhere")
     state = do(elsewhere)
     assert state.status is Status.FAILED
-    assert "runs of the present settings" in state.detail
+    assert "run of the present settings" in state.detail
     assert not elsewhere.files(Path()).evaluation.exists()
 
 
