@@ -9,9 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-# Of the plan's gain over the actor, what smoothness may cost.
-_SHARE = 0.1
-# And of the return, if that is more: it is less than anybody would notice. A plan that rests
+# Of the return, what smoothness may cost: it is less than anybody would notice. A plan that rests
 # where the other does not is worth a little more.
 _TRIFLE, _REST = 3e-3, 1e-2
 RESTS = 0.02
@@ -99,8 +97,8 @@ def choose(
 
     Of those that are clearly smoother than what stays, with at most two thirds of its chatter, the
     smoothest takes its place that does not earn less, by over one standard error, than what
-    smoothness may cost: a tenth of the gain over the actor, or 0.3 % of the actor's return, or 1 %
-    for one that rests in the end. The benefit of doubt ends where the loss looks twice as large.
+    smoothness may cost: 0.3 % of the return, or 1 % for one that rests in the end. The benefit of
+    doubt ends where the loss looks twice as large.
     None does that falls behind the actor, by over one standard error, unless that is smoother too.
 
     The plan that is chosen acts if it earns more than the actor, or less, but not by over one
@@ -141,7 +139,7 @@ def choose(
         other: way.mean_chatter
         for other, way in ways.items()
         if way.smoother_than(best)
-        and _costs_little(way, best, actor)
+        and _costs_little(way, best)
         and (behind[name] or not behind[other] or actor.smoother_than(best))
     }
     name = min(calm, key=calm.__getitem__, default=name)
@@ -181,10 +179,10 @@ def in_doubt(own: Way, others: Sequence[Way], *, confidence: float = 2.0) -> boo
     return any(abs(gap) > max(least, confidence * error) for gap, error in gaps)
 
 
-def _costs_little(way: Way, best: Way, actor: Way) -> bool:
+def _costs_little(way: Way, best: Way) -> bool:
     """Whether a way earns as much as the best, but for what its smoothness may cost."""
-    trifle = _REST if way.mean_chatter <= RESTS < best.mean_chatter else _TRIFLE
-    allowed = max(_SHARE * best.ahead_of(actor)[0], trifle * abs(actor.mean_return))
+    share = _REST if way.mean_chatter <= RESTS < best.mean_chatter else _TRIFLE
+    allowed = share * abs(best.mean_return)
     ahead, error = way.ahead_of(best)
     return ahead >= -allowed - min(error, allowed)
 
