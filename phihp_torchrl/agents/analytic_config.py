@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from phihp_torchrl.config import (
+    Steps,
     check_count,
     check_fields,
     check_not_negative,
     check_positive,
     check_positive_share,
     check_share,
+    check_steps,
 )
 
 
@@ -19,8 +21,8 @@ class AnalyticConfig:
     """Hyper-parameters of policy gradients through the model; the networks and γ are TD3's.
 
     Args:
-        horizon: steps of the model through which the gradient of a return goes; the critics' value
-            follows.
+        horizon: steps of the model through which the gradient of a return goes, or their duration,
+            such as "0.8 s"; the critics' value follows.
         trace: λ of the critics' TD(λ) targets.
         noise: std of the noise on the actor's output before its tanh, at first; it falls with the
             learning rates.
@@ -42,10 +44,11 @@ class AnalyticConfig:
         >>> AnalyticConfig(horizon=0)
         Traceback (most recent call last):
         ...
-        phihp_torchrl.config.ConfigError: horizon: expected a whole number >= 1, got 0.
+        phihp_torchrl.config.ConfigError: horizon: expected a whole number >= 1 of steps, or \
+seconds such as '1.5 s', got 0.
     """
 
-    horizon: int = 16
+    horizon: Steps = 16
     trace: float = 0.95
     noise: float = 0.3
     entropy: float = 5e-4
@@ -58,7 +61,8 @@ class AnalyticConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        check_count(self, "horizon", "critic_updates")
+        check_steps(self, "horizon")
+        check_count(self, "critic_updates")
         check_share(self, "trace")
         check_not_negative(self, "noise", "entropy")
         check_positive(self, "step_limit", "norm_limit")

@@ -22,6 +22,7 @@ from phihp_torchrl.agents.equations import adam_, adam_rates, critic_loss, soft_
 from phihp_torchrl.agents.gradients import grad_and_value
 from phihp_torchrl.agents.update import ActorCriticUpdate, Networks
 from phihp_torchrl.compilation import compile_graph
+from phihp_torchrl.config import resolve_seconds
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Batch
 from phihp_torchrl.tasks import ActionBounds
@@ -87,7 +88,8 @@ class AnalyticUpdate(ActorCriticUpdate):
         compile: bool = False,
     ) -> None:
         super().__init__(loss, world_model)
-        self.config, self.gamma = config, gamma
+        self.config = resolve_seconds(config, world_model.task.time_step)
+        self.gamma = gamma
         self.register_buffer("return_range", torch.zeros_like(self.actor[0][0, 0]))
         if compile and not world_model.compiles:
             _logger.warning("Updates are not compiled: the model's integrator does not compile.")

@@ -20,6 +20,7 @@ from phihp_torchrl.config import (
     check_positive,
     check_share,
     check_steps,
+    in_seconds,
 )
 from phihp_torchrl.imagination import StartConfig
 from phihp_torchrl.trainers.learners import LEARNERS
@@ -178,12 +179,11 @@ class PolicyConfig:
                 )
 
     def _check_analytic(self) -> None:
-        count = self.analytic.critic_updates
-        for name, value in (
-            ("updates", self.updates),
-            ("evaluation_interval", self.evaluation_interval),
-            ("num_worlds * analytic.horizon", self.num_worlds * self.analytic.horizon),
-        ):
+        count, horizon = self.analytic.critic_updates, self.analytic.horizon
+        numbers = {"updates": self.updates, "evaluation_interval": self.evaluation_interval}
+        if not in_seconds(horizon):  # else this is looked at again once they are steps
+            numbers["num_worlds * analytic.horizon"] = self.num_worlds * horizon
+        for name, value in numbers.items():
             if value % count:
                 raise ConfigError(
                     name,

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from phihp_torchrl.agents import RefitConfig, TD3Config
+from phihp_torchrl.agents import AnalyticConfig, RefitConfig, TD3Config
 from phihp_torchrl.config import (
     ConfigError,
     Discount,
@@ -117,6 +117,7 @@ def test_settings_that_must_fit_each_other_are_checked_once_they_are_known() -> 
 IN_SECONDS = {
     TD3Config: ("gamma", "value_expansion"),
     RefitConfig: ("horizon",),
+    AnalyticConfig: ("horizon",),
     PolicyConfig: ("max_age", "evaluation_steps"),
     CollectConfig: ("planning_horizon", "replan_every", "random_hold"),
     CEMConfig: ("planning_horizon", "replan_every", "gamma"),

@@ -39,6 +39,12 @@ def test_a_resumed_run_is_the_same_run():
     assert_same_state(whole.state_dict(), resumed.state_dict(), but=["seconds"])
 
 
+def test_a_horizon_may_be_given_in_seconds() -> None:
+    horizon = f"{4 * PENDULUM.time_step} s"
+    config = replace(ANALYTIC, analytic=replace(ANALYTIC.analytic, horizon=horizon))
+    assert policy_trainer(config).config == ANALYTIC
+
+
 def test_work_is_counted():
     trainer = policy_trainer(ANALYTIC, world=SimulatedWorld(PENDULUM))
     counts = []
