@@ -16,14 +16,16 @@ from phihp_torchrl.planners import SearchConfig, score_sequences
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_contest import Contest
 from phihp_torchrl.trainers.calibrate_report import report, summary, warn_of_doubt, write_table
-from phihp_torchrl.trainers.calibrate_rule import RESTS, Choice, choose, in_doubt
-from phihp_torchrl.trainers.calibrate_ways import LEAVING, calmer, leaving
+from phihp_torchrl.trainers.calibrate_rule import RESTS, Choice, choose, in_doubt, loses_nothing
+from phihp_torchrl.trainers.calibrate_ways import LEAVING, calmer, faster, leaving
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, register_phase
 
 # Where plans promise at most the reward of so many steps beyond an actor that rests, it is left
 # alone there.
 _LITTLE = 3.0
+# The way to plan that is as the chosen one, on the fast budget.
+_FAST = "fast"
 # States of the actor's second halves, for each episode, at which plans say what they promise.
 _PROMISES = 8
 _PROMISE_SHARE = 0.95
@@ -36,8 +38,9 @@ class CalibratePhase:
     same noise, and a rule (:func:`~phihp_torchrl.trainers.calibrate_rule.choose`) chooses. Where
     the actor rests in the end and plans promise little beyond it, the ways are plans that leave it
     alone there; else they are the settings as given and calmer ones, and those that leave it alone
-    too if it rests. More episodes are played while it is in doubt who is to act. No real step is
-    taken.
+    too if it rests. More episodes are played while it is in doubt who is to act. At last the plan
+    that is to act plays the same episodes on the fast budget, and keeps that if it loses nothing.
+    No real step is taken.
 
     Where other models that fit the data about as well say that the actor earns something else, the
     settings stay as given and the plan acts unless it is certain to earn less, and a warning says
@@ -83,6 +86,8 @@ class CalibratePhase:
         self.doubted = False
         """Whether they say something else than the model by which plans are made."""
         self.base: SearchConfig = agent.planner_config
+        self.chosen: Choice | None = None
+        """The way to plan and who acts, once that is known and the fast budget is not yet."""
         self.final: dict[str, Any] = {}
         generator = torch.Generator().manual_seed(seed)
         starts = agent.task.sample_start([config.max_episodes], generator)
@@ -127,7 +132,9 @@ class CalibratePhase:
             "gain_error": error,
             "chatter": way.mean_chatter,
         }
-        if contest.equal:
+        if self.chosen is not None:
+            self._finish(self.chosen)
+        elif contest.equal:
             choice = self._choose()
             metrics["acting_planner"] = float(choice.acting == "planner")
         return {f"calibrate/{key}": value for key, value in metrics.items()}
@@ -146,6 +153,7 @@ class CalibratePhase:
             "contest": self.contest.state_dict(),
             "elsewhere": list(self.elsewhere),
             "doubted": self.doubted,
+            "chosen": None if self.chosen is None else tuple(self.chosen),
             "final": dict(self.final),
         }
 
@@ -154,6 +162,8 @@ class CalibratePhase:
         self.contest.load_state_dict(state["contest"])
         self.elsewhere = list(state.get("elsewhere", ()))
         self.doubted = bool(state.get("doubted", False))
+        chosen = state.get("chosen")
+        self.chosen = None if chosen is None else Choice(*chosen)
         self.final = dict(state["final"])
 
     def _ways(self) -> dict[str, dict[str, Any]]:
@@ -208,12 +218,27 @@ class CalibratePhase:
         if rests or calm:  # this is smooth already, or the calmest that is taken
             contest.close()
         if contest.next_way is None and (choice.certain or not contest.double()):
-            models = {"models_disagree": self.doubted, "actor_elsewhere": self.elsewhere}
-            self.final = summary(choice, ways, actor) | models
-            report(self.final)
-            if self.path is not None:
-                write_table(self.path, self.final, self.planner_config)
+            cheap = faster(self.base, plan.changes)
+            if cheap and choice.acting == "planner" and not self.doubted:
+                self.chosen = choice
+                contest.add(_FAST, cheap)
+            else:
+                self._finish(choice)
         return choice
+
+    def _finish(self, choice: Choice) -> None:
+        """Record the choice, on the fast budget if that has played and loses nothing."""
+        ways, actor = self.contest.all_ways(), self.contest.actor(self.contest.episodes)
+        fast = _FAST in ways and loses_nothing(ways[_FAST], ways[choice.name])
+        if fast:
+            gain, error = ways[_FAST].ahead_of(actor)
+            choice = choice._replace(name=_FAST, gain=gain, gain_error=error)
+        models = {"models_disagree": self.doubted, "actor_elsewhere": self.elsewhere}
+        budget = {"budget": _FAST if fast else "full"}
+        self.final = summary(choice, ways, actor) | budget | models
+        report(self.final)
+        if self.path is not None:
+            write_table(self.path, self.final, self.planner_config)
 
 
 def _build(context: Context) -> Phase:

@@ -103,6 +103,11 @@ class Contest:
         self.close()
         return True
 
+    def add(self, name: str, changes: Mapping[str, Any]) -> None:
+        """Let one more way to plan enter, which plays as many episodes as the others have."""
+        self.ways[name] = dict(changes)
+        self._played[name] = [[], []]
+
     def close(self) -> None:
         """Let no further way to plan enter."""
         self.ways = {name: self.ways[name] for name in self._played}

@@ -15,6 +15,14 @@ LEAVING = ("leaving", "priced")
 _NOTHING = 1e-3
 # A search that goes on from the previous plan, and keeps it unless another is better.
 _STANDING = {"noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
+# What a plan has at most on the fast budget (config/settings/budget/fast.yaml).
+_FAST = {
+    "planning_horizon": 3,
+    "optim_steps": 2,
+    "num_candidates": 32,
+    "top_k": 6,
+    "num_policy_candidates": 8,
+}
 # Std of the search near the previous plan, in units of the half-range.
 _NEAR, _NEARER = 0.3, 0.1
 
@@ -73,6 +81,30 @@ def calmer(config: SearchConfig, reward: float) -> dict[str, dict[str, Any]]:
         if changes:
             ways[name] = changes
     return ways
+
+
+def faster(config: SearchConfig, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A way to plan on the fast budget, as changes of the planner's settings.
+
+    Args:
+        config: the planner's settings.
+        changes: those of the way, which it keeps.
+
+    Returns:
+        The changes; none where the way is as cheap already.
+
+    Examples:
+        >>> from phihp_torchrl.planners import CEMConfig
+        >>> faster(CEMConfig(planning_horizon=2, num_candidates=64, top_k=4), {"noise_beta": 2.0})
+        {'noise_beta': 2.0, 'num_candidates': 32, 'num_policy_candidates': 8}
+        >>> faster(CEMConfig(planning_horizon=3, num_candidates=32, num_policy_candidates=4), {})
+        {}
+    """
+    known = {field.name for field in fields(config)}
+    less = {name: most for name, most in _FAST.items() if name in known}
+    less = {name: most for name, most in less.items() if getattr(config, name) > most}
+    cheap = _fitting(config, {**changes, **less})
+    return cheap if less else {}
 
 
 def _fitting(config: SearchConfig, changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from phihp_torchrl.trainers import (
 from phihp_torchrl.trainers import calibrate as calibrate_module
 from phihp_torchrl.trainers.calibrate_budget import Price, first_episodes
 from phihp_torchrl.trainers.calibrate_rule import Choice
-from phihp_torchrl.trainers.calibrate_ways import calmer, leaving
+from phihp_torchrl.trainers.calibrate_ways import calmer, faster, leaving
 from phihp_torchrl.trainers.imagined_play import play
 
 from .run_parts import CONFIG, with_sections
@@ -243,6 +243,59 @@ def test_where_plans_promise_much_beyond_an_actor_that_rests_all_ways_may_play(m
     ways = list(finished(make_agent()).final["ways"])
     assert ways[:3] == ["given", "leaving", "priced"]
     assert "calm" in ways
+
+
+WIDE = replace(SMALL, num_candidates=64)
+
+
+@pytest.mark.parametrize("loses", [True, False])
+def test_a_plan_that_acts_keeps_the_fast_budget_if_it_loses_nothing(monkeypatch, tmp_path, loses):
+    chosen = Choice("leaving", "planner", True, 1.0, 0.1)
+    monkeypatch.setattr(calibrate_module, "choose", lambda ways, actor, **_: chosen)
+    monkeypatch.setattr(calibrate_module, "loses_nothing", lambda cheap, plan: not loses)
+    phase = finished(make_agent(planner=WIDE), path=tmp_path / "table.json")
+    table = json.loads((tmp_path / "table.json").read_text())
+    assert list(table["ways"])[-1] == "fast"
+    assert table["budget"] == ("full" if loses else "fast")
+    assert table["way"] == ("leaving" if loses else "fast")
+    assert table["gain"] == (1.0 if loses else table["ways"]["fast"]["gain"])
+    assert phase.planner_config.num_candidates == (64 if loses else 32)
+    # It plays as the chosen way does.
+    assert phase.planner_config.actor_margin == table["ways"]["leaving"]["changes"]["actor_margin"]
+    assert phase.progress[0] == phase.progress[1] == TINY.episodes * len(table["ways"])
+
+
+@pytest.mark.parametrize(("acting", "planner"), [("actor", WIDE), ("planner", SMALL)])
+def test_where_the_actor_acts_or_plans_are_cheap_none_is_played_faster(
+    monkeypatch, acting, planner
+):
+    chosen = Choice("leaving", acting, True, 1.0, 0.1)
+    monkeypatch.setattr(calibrate_module, "choose", lambda ways, actor, **_: chosen)
+    final = finished(make_agent(planner=planner)).final
+    assert "fast" not in final["ways"]
+    assert final["budget"] == "full"
+
+
+def test_an_interrupted_phase_goes_on_with_the_fast_budget(monkeypatch):
+    chosen = Choice("leaving", "planner", True, 1.0, 0.1)
+    monkeypatch.setattr(calibrate_module, "choose", lambda ways, actor, **_: chosen)
+    agent = make_agent(planner=WIDE)
+    begun, resumed = (CalibratePhase(agent, TINY, seed=0) for _ in range(2))
+    while begun.chosen is None:
+        begun.advance()
+    resumed.load_state_dict(begun.state_dict())
+    for phase in (begun, resumed):
+        assert not phase.done
+        phase.advance()
+    assert resumed.final == begun.final
+    assert "fast" in resumed.final["ways"]
+
+
+def test_the_fast_budget_is_that_of_the_settings():
+    fast = read_run_config(load_config("pendulum", overrides=["budget=fast"])).planner
+    changes = faster(CEMConfig(50, optim_steps=9, num_candidates=900, top_k=90), {})
+    assert changes == {name: getattr(fast, name) for name in changes}
+    assert len(changes) == 5
 
 
 def test_where_models_disagree_the_settings_stay_as_given(caplog):

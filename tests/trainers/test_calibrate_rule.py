@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from phihp_torchrl.trainers.calibrate_rule import Choice, Way, choose, in_doubt
+from phihp_torchrl.trainers.calibrate_rule import Choice, Way, choose, in_doubt, loses_nothing
 
 
 def way(*returns: float, chatter: float = 0.4) -> Way:
@@ -107,6 +107,23 @@ def test_what_is_better_is_what_the_calm_ones_are_measured_by() -> None:
     better, calm = way(19.0, 21.0, 19.0, 21.5), way(12.0, 14.0, 12.0, 14.0, chatter=0.0)
     assert pick(GIVEN, calm).name == pick(GIVEN, better).name == "1"
     assert pick(GIVEN, calm, better).name == "2"
+
+
+@pytest.mark.parametrize(
+    ("returns", "chatter", "kept"),
+    [
+        ((1000.0, 1000.0, 1000.0, 1000.0), 0.4, True),
+        ((1000.0, 1000.0, 1000.0, 1000.0), 0.42, False),  # it is rougher
+        ((997.5, 997.5, 997.5, 997.5), 0.4, True),
+        ((996.5, 996.5, 996.5, 996.5), 0.4, False),
+        ((990.0, 1010.0, 990.0, 1010.0), 0.4, False),  # as good, but nobody knows
+        ((1005.0, 1025.0, 1005.0, 1025.0), 0.4, True),
+        ((math.nan, 1000.0, 1000.0, 1000.0), 0.4, False),
+    ],
+)
+def test_a_cheaper_plan_must_be_shown_to_lose_nothing(returns, chatter, kept) -> None:
+    plan = way(*(1000.0,) * 4)
+    assert loses_nothing(way(*returns, chatter=chatter), plan) is kept
 
 
 # The plan, or the actor.
