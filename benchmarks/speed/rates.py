@@ -1,10 +1,12 @@
 """How long phases took in committed runs, for the expected duration that a run says first.
 
-    python benchmarks/speed/rates.py [results/runs ...]
+    python benchmarks/speed/rates.py [results/runs results/six_tasks ...]
 
 It writes ``phihp_torchrl/trainers/rates.json``: by method, preset, task and phase, the 10th, 50th
 and 90th percentile over runs of the seconds for each unit of the setting that says how much work
-there is. The evaluation's time hardly depends on its episodes, which are played as a batch.
+there is. Where several directories have runs of a method, preset and task, the last that is named
+decides: it has the newest. The evaluation's time hardly depends on its episodes, which are played
+as a batch.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 from statistics import median, quantiles
+from typing import Any
 
 import yaml
 
@@ -26,24 +29,29 @@ FILE = Path(__file__).parents[2] / "phihp_torchrl" / "trainers" / "rates.json"
 
 def main(places: list[str]) -> None:
     """Read finished runs in directories, and write the file."""
-    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    versions, machines, count = set(), set(), 0
-    for path in sorted(p for place in places for p in Path(place).glob("*/metadata.json")):
-        metadata = json.loads(path.read_text())
-        config = yaml.safe_load((path.parent / "config.yaml").read_text())
-        if "seconds" not in metadata or len(metadata["sessions"]) != 1:
-            continue
-        count += 1
-        session = metadata["sessions"][0]
-        versions.add(session["versions"]["phihp_torchrl"])
-        machines.add(machine_text(session))
-        key = "/".join((config.get("method", "phihp"), config["preset"], config["task"]))
-        for phase, seconds in metadata["seconds"].items():
-            amount = config[phase][PER[phase]] if phase in PER else 1
-            if amount:
-                found[key][phase].append(seconds / amount)
+    found: dict[str, dict[str, list[float]]] = {}
+    about: dict[str, list[dict[str, Any]]] = {}
+    for place in places:
+        here: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+        sessions: dict[str, list[dict[str, Any]]] = defaultdict(list)
+        for path in sorted(Path(place).glob("*/metadata.json")):
+            metadata = json.loads(path.read_text())
+            config = yaml.safe_load((path.parent / "config.yaml").read_text())
+            if "seconds" not in metadata or len(metadata["sessions"]) != 1:
+                continue
+            key = "/".join((config.get("method", "phihp"), config["preset"], config["task"]))
+            sessions[key] += metadata["sessions"]
+            for phase, seconds in metadata["seconds"].items():
+                amount = config[phase][PER[phase]] if phase in PER else 1
+                if amount:
+                    here[key][phase].append(seconds / amount)
+        found |= here
+        about |= sessions
+    used = [session for of in about.values() for session in of]
+    versions = {session["versions"]["phihp_torchrl"] for session in used}
+    machines = {machine_text(session) for session in used}
     rates = {
-        "from": {"runs": count, "versions": sorted(versions), "machines": sorted(machines)},
+        "from": {"runs": len(used), "versions": sorted(versions), "machines": sorted(machines)},
         "per": PER,
         "seconds": {
             key: {phase: _three(values) for phase, values in of.items()}
@@ -61,4 +69,4 @@ def _three(values: list[float]) -> list[float]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or ["results/runs"])
+    main(sys.argv[1:] or ["results/runs", "results/six_tasks"])
