@@ -26,6 +26,8 @@ from phihp_torchrl.trainers.phases import Phase, register_phase
 _LITTLE = 3.0
 # The way to plan that is as the chosen one, on the fast budget.
 _FAST = "fast"
+# Episodes from which on a difference of so many standard errors is taken as certain.
+_KNOWN = 12
 # States of the actor's second halves, for each episode, at which plans say what they promise.
 _PROMISES = 8
 _PROMISE_SHARE = 0.95
@@ -38,9 +40,9 @@ class CalibratePhase:
     same noise, and a rule (:func:`~phihp_torchrl.trainers.calibrate_rule.choose`) chooses. Where
     the actor rests in the end and plans promise little beyond it, the ways are plans that leave it
     alone there; else they are the settings as given and calmer ones, and those that leave it alone
-    too if it rests. More episodes are played while it is in doubt who is to act. At last the plan
-    that is to act plays the same episodes on the fast budget, and keeps that if it loses nothing.
-    No real step is taken.
+    too if it rests. The way that is chosen plays more episodes, until it is certain whether it
+    earns more than the actor. At last the plan that is to act plays the same episodes on the fast
+    budget, and keeps that if it loses nothing. No real step is taken.
 
     Where other models that fit the data about as well say that the actor earns something else, the
     settings stay as given and the plan acts unless it is certain to earn less, and a warning says
@@ -207,24 +209,34 @@ class CalibratePhase:
         return gain.quantile(_PROMISE_SHARE).item() if len(gain) else 0.0
 
     def _choose(self) -> Choice:
-        """Choose; where all have played, keep the choice or ask for as many episodes again."""
-        contest, ways = self.contest, self.contest.all_ways()
+        """Choose a way to plan; once all have played, let it alone play on, until it is known."""
+        contest = self.contest
+        first = next(iter(contest.ways))
+        ways = {name: contest.way(name) for name in contest.playing if contest.has_played(name)}
         actor = contest.actor(contest.episodes)
         confidence = self.config.confidence
         choice = choose(ways, actor, confidence=confidence, doubted=self.doubted)
-        plan, first = ways[choice.name], next(iter(ways))
+        plan = ways[choice.name]
         rests = choice.certain and choice.gain >= 0.0 and plan.mean_chatter <= RESTS
         calm = choice.name not in (first, *LEAVING)
         if rests or calm:  # this is smooth already, or the calmest that is taken
             contest.close()
-        if contest.next_way is None and (choice.certain or not contest.double()):
-            cheap = faster(self.base, plan.changes)
-            if cheap and choice.acting == "planner" and not self.doubted:
-                self.chosen = choice
-                contest.add(_FAST, cheap)
-            else:
-                self._finish(choice)
+        if contest.next_way is None:
+            contest.keep(choice.name)
+            same = choice.gain == choice.gain_error == 0.0
+            known = same or (choice.certain and contest.episodes >= _KNOWN)
+            if known or not contest.double():
+                self._settle(choice)
         return choice
+
+    def _settle(self, choice: Choice) -> None:
+        """Let the plan that is to act play on the fast budget; where there is none, finish."""
+        cheap = faster(self.base, self.contest.ways[choice.name])
+        if cheap and choice.acting == "planner" and not self.doubted:
+            self.chosen = choice
+            self.contest.add(_FAST, cheap)
+        else:
+            self._finish(choice)
 
     def _finish(self, choice: Choice) -> None:
         """Record the choice, on the fast budget if that has played and loses nothing."""

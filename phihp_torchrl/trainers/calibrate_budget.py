@@ -20,6 +20,8 @@ _OPERATIONS = 60
 _WEIGHTS = 10_000
 # Episodes that each way plays in any case: below them a standard error says little.
 _LEAST = 3
+# What all ways may have of the budget. The rest is for the one that is chosen.
+_WAYS = 0.6
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,11 @@ class Price:
         return total / getattr(planner, "replan_every", 1)
 
 
+def of_ways(config: CalibrateConfig) -> float:
+    """What all ways may imagine, before one of them plays on."""
+    return _WAYS * config.budget
+
+
 def first_episodes(config: CalibrateConfig, price: Price, steps: float, ways: int) -> int:
     """Episodes that each way of planning plays before there is doubt.
 
@@ -79,7 +86,7 @@ def first_episodes(config: CalibrateConfig, price: Price, steps: float, ways: in
         [6, 6, 3]
     """
     for episodes in range(config.episodes, min(_LEAST, config.episodes), -1):
-        if ways * steps * price.plan(episodes) <= config.budget:
+        if ways * steps * price.plan(episodes) <= of_ways(config):
             return episodes
     return min(_LEAST, config.episodes)
 

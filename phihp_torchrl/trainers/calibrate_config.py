@@ -14,14 +14,15 @@ class CalibrateConfig:
     Args:
         enabled: whether to calibrate; false takes the settings of the section planner as they are,
             and the run has no such phase.
-        episodes: paired imagined episodes, before there is doubt.
+        episodes: paired imagined episodes of each way to plan; the one that is chosen plays more.
         confidence: standard errors by which one way to plan must beat another, and by which one of
             plan and actor beats the other without doubt.
         max_episodes: episodes at most; their number doubles while it is in doubt who is to act.
-        budget: transitions that plans may imagine; a call of the model counts as a thousand more,
-            and one of a network as one for each ten thousand weights, so a million takes about a
-            second of one core. Transitions of a model whose step has over 60 tensor operations
-            count more in proportion. Three episodes of two ways to plan are played in any case.
+        budget: transitions that plans may imagine, three fifths of them before a way is chosen; a
+            call of the model counts as a thousand more, and one of a network as one for each ten
+            thousand weights, so a million takes about half a second of one core. Transitions of a
+            model whose step has over 60 tensor operations count more in proportion. Three episodes
+            of two ways to plan, and six of the one that is chosen, are played in any case.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.
@@ -37,7 +38,7 @@ class CalibrateConfig:
     episodes: int = 6
     confidence: float = 2.0
     max_episodes: int = 48
-    budget: int = 36_000_000
+    budget: int = 60_000_000
 
     def __post_init__(self) -> None:
         check_fields(self)

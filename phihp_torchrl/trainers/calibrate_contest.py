@@ -13,13 +13,15 @@ from torch import Tensor, nn
 
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.trainers.calibrate_budget import Price, first_episodes
+from phihp_torchrl.trainers.calibrate_budget import Price, first_episodes, of_ways
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_rule import Way
 from phihp_torchrl.trainers.imagined_play import Played, play
 
 # Ways to plan that play whatever they cost; further ones do as far as the budget goes.
 _IN_ANY_CASE = 2
+# Episodes that a way plays whatever they cost once it is the only one left.
+_ALONE = 6
 
 
 class Contest:
@@ -47,12 +49,13 @@ class Contest:
         self.world_model = TaskWorldModel(agent.task, agent.dynamics)
         self.starts, self.seed, self.price = starts, seed, Price.of(agent)
         self.ways: dict[str, dict[str, Any]] = {}
+        self.playing: list[str] = []
         self.episodes, self.spent = 0, 0.0
         self._played: dict[str, list[list[float]]] = {}
 
     def begin(self, ways: Mapping[str, dict[str, Any]]) -> None:
         """Name the ways to plan, as changes of the planner's settings, the first one first."""
-        self.ways = dict(ways)
+        self.ways, self.playing = dict(ways), list(ways)
         self.episodes = first_episodes(self.config, self.price, self._length, len(ways))
 
     @cached_property
@@ -63,18 +66,19 @@ class Contest:
     @property
     def next_way(self) -> str | None:
         """The way to plan that has yet to play; none once all have played this lot."""
-        return next((name for name in self.ways if self._missing(name)), None)
+        return next((name for name in self.playing if self._missing(name)), None)
 
     @property
     def equal(self) -> bool:
-        """Whether all ways that have played at all have played this lot."""
-        return all(len(returns) == self.episodes for returns, _ in self._played.values())
+        """Whether all that play on, and have played at all, have played this lot."""
+        played = (self._played[name][0] for name in self.playing if name in self._played)
+        return all(len(returns) == self.episodes for returns in played)
 
     @property
     def progress(self) -> tuple[int, int]:
         """Episodes of plans that are played, and all of this lot and those before."""
         count = sum(len(returns) for returns, _ in self._played.values())
-        return count, max(count, len(self.ways) * self.episodes)
+        return count, count + sum(map(self._missing, self.playing))
 
     def play(self, name: str) -> None:
         """Let a way to plan play the episodes of this lot."""
@@ -96,21 +100,29 @@ class Contest:
             Whether they do.
         """
         more = min(self.episodes, self.config.max_episodes - self.episodes)
-        following = self.spent * (1 + more / self.episodes)
-        if more < 1 or following > self.config.budget:
+        cost = len(self.playing) * self._cost(more, self._length)
+        dear = self.spent + cost > self.config.budget
+        if more < 1 or (dear and self.episodes + more > _ALONE):
             return False
         self.episodes += more
-        self.close()
         return True
 
     def add(self, name: str, changes: Mapping[str, Any]) -> None:
-        """Let one more way to plan enter, which plays as many episodes as the others have."""
+        """Let one more way to plan play as many episodes as the last ones have."""
         self.ways[name] = dict(changes)
-        self._played[name] = [[], []]
+        self.playing, self._played[name] = [name], [[], []]
 
     def close(self) -> None:
         """Let no further way to plan enter."""
-        self.ways = {name: self.ways[name] for name in self._played}
+        self.playing = [name for name in self.playing if name in self._played]
+
+    def keep(self, name: str) -> None:
+        """Let one way to plan alone play on."""
+        self.playing = [name]
+
+    def has_played(self, name: str) -> bool:
+        """Whether a way to plan has played at all."""
+        return name in self._played
 
     def way(self, name: str) -> Way:
         """What a way to plan has earned so far."""
@@ -142,11 +154,12 @@ class Contest:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that a resumed run needs; the actor's episodes are played again."""
-        names = ("ways", "episodes", "spent", "_played")
+        names = ("ways", "playing", "episodes", "spent", "_played")
         return {name: copy.deepcopy(getattr(self, name)) for name in names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a :meth:`state_dict`."""
+        self.playing = list(state["ways"])  # older checkpoints do not say
         for name, value in state.items():
             setattr(self, name, copy.deepcopy(value))
 
@@ -161,7 +174,7 @@ class Contest:
         if played is not None:
             return self.episodes - len(played[0])
         optional = list(self.ways).index(name) >= _IN_ANY_CASE
-        dear = self.spent + self._cost(self.episodes, self._length) > self.config.budget
+        dear = self.spent + self._cost(self.episodes, self._length) > of_ways(self.config)
         return 0 if optional and dear else self.episodes
 
     def _cost(self, episodes: int, steps: float) -> float:

@@ -51,14 +51,16 @@ class Way:
     def ahead_of(self, other: Way) -> tuple[float, float]:
         """Mean paired difference of the returns, and its standard error.
 
-        It is minus infinity where one of ours is not finite, and infinity where one of the other's
-        is not.
+        Where one has played more episodes, these are left out. It is minus infinity where one of
+        ours is not finite, and infinity where one of the other's is not.
         """
-        if not all(map(math.isfinite, self.returns)):
+        count = min(len(self.returns), len(other.returns))
+        ours, theirs = self.returns[:count], other.returns[:count]
+        if not all(map(math.isfinite, ours)):
             return -math.inf, 0.0
-        if not all(map(math.isfinite, other.returns)):
+        if not all(map(math.isfinite, theirs)):
             return math.inf, 0.0
-        gap = torch.tensor(self.returns).double() - torch.tensor(other.returns).double()
+        gap = torch.tensor(ours).double() - torch.tensor(theirs).double()
         return gap.mean().item(), (gap.std() / len(gap) ** 0.5).item()
 
     def smoother_than(self, other: Way) -> bool:
@@ -101,14 +103,11 @@ def choose(
     doubt ends where the loss looks twice as large.
     None does that falls behind the actor, by over one standard error, unless that is smoother too.
 
-    The plan that is chosen acts if it earns more than the actor, or less, but not by over one
-    standard error: a plan looks further than its actor and is compared with it at every step, so
-    what is in doubt is more likely a gain. Where the actor is clearly smoother, the plan acts only
-    if it earns more by over one standard error. Where both earn exactly the same in each episode,
-    the actor, which is cheaper, acts, unless the plan is clearly smoother. Beyond
-    ``confidence`` standard errors, on either side, the choice is certain; all else is doubtful and
-    deserves more episodes. Those are a second look at the same question, which a bound of two
-    standard errors passes a little more often than one look would.
+    The plan that is chosen acts if it earns more than the actor by over one standard error; else
+    the actor does, which is cheaper. Where both earn exactly the same in each episode, a plan that
+    is clearly smoother acts. Beyond ``confidence`` standard errors, on either side, the choice is
+    certain; all else is doubtful and deserves more episodes. Those are a second look at the same
+    question, which a bound of two standard errors passes a little more often than one look would.
 
     Where the model itself is doubted, the plan acts unless it is certain to earn less. It answers
     at every step to where the world has gone; the actor has learned in that model alone, in which
@@ -150,10 +149,8 @@ def choose(
         acts = plan.smoother_than(actor)
     elif doubted:
         acts = gain >= -confidence * error
-    elif actor.smoother_than(plan):
-        acts = gain > min(confidence, 1.0) * error
     else:
-        acts = not behind[name]
+        acts = gain > min(confidence, 1.0) * error
     certain = same or abs(gain) > confidence * error
     return Choice(name, "planner" if acts else "actor", certain, gain, error)
 
