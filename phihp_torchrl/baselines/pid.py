@@ -24,6 +24,8 @@ class PID(Controller):
     may jump; a component without one gets a PI controller. The integral stands still while the
     action is on a bound and the error would drive it further (conditional integration).
 
+    Where the task has a reference of components of the state, it is the set point of their loops.
+
     Loops are tuned one by one, from the linear model at the set point (:meth:`from_model`). They
     ignore one another, and every component that has no loop: a PID on a pole does not keep its
     cart in place. Dead time and lag of an actuator are in the model that tunes the loops, but where
@@ -65,6 +67,7 @@ class PID(Controller):
                 )
             )
         self._integral: Tensor | None = None
+        self._followed = _followed(point.task)
 
     @classmethod
     def from_model(
@@ -81,18 +84,25 @@ class PID(Controller):
         Args:
             task: the task.
             dynamics: the model, ``(state, action) -> next state``.
-            goal: the state with the set points. Defaults to the task's goal.
+            goal: the state with the set points. Defaults to the task's goal; for a task with a
+                reference to the middle of that, and of the wide box in all else.
             components: component of the state by name of the action. By default each action has
-                the one that it moves most, in units of the half-range of the task's wide box.
+                the one that it moves most, in units of the half-range of the task's wide box, of
+                those of the reference if there is one.
             time_constant: λ of all loops, in seconds; by default the shortest robust one.
 
         Raises:
             ConfigError: for an unknown name, where the task has no goal, and where no gains give a
                 stable loop; the message names the component.
         """
-        point = linearise(task, dynamics, goal, registers=is_smooth(task))
+        followed = _followed(task)
+        if followed and goal is None:
+            goal = _middle(task)
+        point = linearise(task, dynamics, goal, registers=is_smooth(task), follows=list(followed))
         if components is None:
-            components = pair(point, half_ranges(task)[0].numpy())
+            components = pair(point, half_ranges(task)[0].numpy(), list(followed) or None)
+            if not components:
+                raise ConfigError("components", "expected some that an action moves, got none.")
         known = (("components", components, task.system.action_names),
                  ("components", components.values(), task.system.state_names))  # fmt: skip
         for key, names, expected in known:
@@ -105,8 +115,11 @@ class PID(Controller):
         return cls(point, gains, components)
 
     def act(self, state: Tensor, starts: Tensor | None = None) -> Tensor:
-        physical = self.task.split(state)[0]
+        physical, registers = self.task.split(state)
         at = self.point.state[: physical.shape[-1]].to(state)
+        if self._followed:
+            at = at.expand_as(physical).clone()
+            at[..., list(self._followed.values())] = _present(self.task, registers)
         error = -self.task.system.difference(physical, at)
         action = self.point.action.to(state).expand(*state.shape[:-1], -1)
         sums = self._recall(error, starts)
@@ -135,3 +148,27 @@ class PID(Controller):
         if kept is None or kept.shape != zero.shape or kept.device != zero.device:
             return zero
         return kept if starts is None else torch.where(starts.unsqueeze(-1), zero, kept)
+
+
+def _followed(task: Task) -> dict[str, int]:
+    """The components of the state that a task's reference is of, and their places."""
+    names = () if task.reference is None else task.reference.names
+    known = task.system.state_names
+    return {name: known.index(name) for name in names} if set(names) <= set(known) else {}
+
+
+def _present(task: Task, registers: Tensor) -> Tensor:
+    """The present value of the reference, ``[*batch, k]``."""
+    assert task.outside is not None
+    return task.outside.values(registers)["reference"]
+
+
+def _middle(task: Task) -> tuple[float, ...]:
+    """The middle of the wide box, and of the reference in what that is of."""
+    box, reference = task.coverage or task.reset, task.reference
+    assert reference is not None
+    ends = zip(box.low, box.high, strict=True)
+    middle = [(low + high) / 2 for low, high in ends]
+    for name, low, high in zip(reference.names, reference.low, reference.high, strict=True):
+        middle[task.system.state_names.index(name)] = (low + high) / 2
+    return tuple(middle)

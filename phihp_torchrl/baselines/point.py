@@ -84,8 +84,9 @@ def linearise(
     goal: Sequence[float] | None = None,
     *,
     registers: bool = True,
+    follows: Sequence[str] = (),
 ) -> LinearModel:
-    """The linear model of one step at the goal, by differentiating the model.
+    """The linear model of one step at the goal: slopes of the model, of states across secants.
 
     Args:
         task: the task.
@@ -93,21 +94,25 @@ def linearise(
         goal: the physical state at which to linearise. Defaults to the task's goal: the centre of
             its box ``goal``, or else a state at rest whose reward no state of the wide box exceeds.
         registers: whether the task's registers, such as commands under way and the last action,
-            belong to the state. With an estimated disturbance they are left out.
+            belong to the state. With an estimated disturbance they are left out, and with a
+            reference.
+        follows: components that follow the task's reference, and have the values of ``goal``; the
+            others are those at which the model rests there.
 
     Raises:
         ConfigError: where there is no such state, or the model does not rest in it, and for a task
-            with a reference or inputs, whose goal moves.
+            with inputs, or with a reference without ``follows``, whose goal moves.
     """
-    for name in ("reference", "inputs"):
+    for name in ("inputs",) if follows else ("reference", "inputs"):
         if getattr(task, name) is not None:
             raise ConfigError(name, f"expected none for a fixed goal, {task.name!r} has {name}.")
     dynamics = copy.deepcopy(dynamics).to(device="cpu", dtype=torch.float64)
     step = physical_step(dynamics)
-    state, action = _rest(task, step, goal)
+    state, action = _rest(task, step, goal, follows)
     at, move = state, step
     # An estimated disturbance is no action's to move.
-    if registers and task.register_count and task.disturbance is None:
+    alone = task.disturbance is None and task.reference is None
+    if registers and task.register_count and alone:
         at = torch.cat([state, task.registers.rest(action)])
         move = _with_registers(task, step)
     with torch.no_grad():
@@ -147,8 +152,11 @@ def _with_registers(task: Task, step: Step) -> Step:
     return move
 
 
-def _rest(task: Task, step: Step, goal: Sequence[float] | None) -> tuple[Tensor, Tensor]:
+def _rest(
+    task: Task, step: Step, goal: Sequence[float] | None, follows: Sequence[str] = ()
+) -> tuple[Tensor, Tensor]:
     """The goal, and the action that keeps it."""
+    free = [i for i, name in enumerate(task.system.state_names) if follows and name not in follows]
     if goal is not None:
         if len(goal) != task.system.state_dim:
             raise ConfigError(
@@ -166,7 +174,7 @@ def _rest(task: Task, step: Step, goal: Sequence[float] | None) -> tuple[Tensor,
         ]
     reasons = []
     for state in places:
-        action, drift = _trim(task, step, state)
+        state, action, drift = _trim(task, step, state, free)
         if drift > _DRIFT:
             reasons.append(f"the model drifts from {_text(state)} by {drift:.2g} half-ranges")
         elif goal is None and _is_exceeded(task, state, action):
@@ -176,20 +184,30 @@ def _rest(task: Task, step: Step, goal: Sequence[float] | None) -> tuple[Tensor,
     raise ConfigError("goal", f"expected a state to stay in: {'; '.join(reasons)}.")
 
 
-def _trim(task: Task, step: Step, state: Tensor) -> tuple[Tensor, float]:
-    """The action ``[m]`` that keeps ``state`` best, and how far it still moves in a step."""
-    ranges, _ = half_ranges(task)
-    action = task.bounds.center.double()
+def _trim(
+    task: Task, step: Step, start: Tensor, free: Sequence[int] = ()
+) -> tuple[Tensor, Tensor, float]:
+    """The action ``[m]`` that keeps a state best, and how far it still moves in a step.
 
-    def drift(a: Tensor) -> Tensor:
-        return task.difference(step(state, a), state) / ranges
+    Components that are ``free`` are sought with the action, from their values at the start.
+    """
+    ranges, _ = half_ranges(task)
+    state, action, count = start, task.bounds.center.double(), len(free)
+    places = torch.tensor(free, dtype=torch.long)
+
+    def drift(sought: Tensor) -> Tensor:
+        here = state.index_put((places,), sought[:count])
+        return task.difference(step(here, sought[count:]), here) / ranges
 
     with torch.no_grad():
         for _ in range(5):
-            slope = jacfwd(drift)(action)
-            action = task.clip_action(action - torch.linalg.pinv(slope, rtol=1e-9) @ drift(action))
-        left = drift(action).abs().max().item()
-    return action, left if left == left else float("inf")
+            sought = torch.cat([state[places], action])
+            slope = jacfwd(drift)(sought)
+            sought = sought - torch.linalg.pinv(slope, rtol=1e-9) @ drift(sought)
+            state = state.index_put((places,), sought[:count])
+            action = task.clip_action(sought[count:])
+        left = drift(torch.cat([state[places], action])).abs().max().item()
+    return state, action, left if left == left else float("inf")
 
 
 def _is_exceeded(task: Task, state: Tensor, action: Tensor) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,10 @@ _PEAK = 1.7
 """The largest peak of the sensitivity that the fastest loop may have (a gain margin of 2.4)."""
 _TIMES = np.geomspace(1.5, 200.0, 40)
 """Time constants that are tried, in time steps."""
+_NOTHING = 1e-9
+"""Effect of an action, per second, that is none."""
+_LONG = 5000
+"""Steps in which a step response has to end."""
 
 
 class Gains(NamedTuple):
@@ -47,6 +52,10 @@ def tune(
     in discrete time and with the registers of an actuator: the shortest λ is taken whose loop is
     stable and whose sensitivity peaks below 1.7, or else the stable one with the lowest peak.
 
+    A component without a velocity that the action moves through another one, such as the speed of a
+    motor through its current, is first order by its step response: its gain, and the time in which
+    it does 63 % of its way.
+
     Args:
         point: the linear model at the set point.
         component: name of the component to be controlled.
@@ -61,8 +70,10 @@ def tune(
     velocity = system.velocity_of.get(component)
     v = None if velocity is None else system.state_names.index(velocity)
     row = y if v is None else v
-    strength = _strength(point, row, u) / seconds
-    if not abs(strength) > 1e-9:
+    strength, decay = _strength(point, row, u) / seconds, (1.0 - point.a[y, y]) / seconds
+    if v is None and not abs(strength) > _NOTHING:
+        strength, decay = _slow(point, y, u)
+    if not abs(strength) > _NOTHING:
         raise ConfigError(
             "component", f"expected one that {action} moves, {component!r} does not answer to it."
         )
@@ -71,7 +82,6 @@ def tune(
     for time in times:
         # With a velocity (s + 1/λ)³ is wanted, without one (s + 1/λ)².
         if v is None:
-            decay = (1.0 - point.a[y, y]) / seconds
             gains = (2.0 / time - decay, 1.0 / time**2, 0.0)
         else:
             pull, drag = -point.a[v, y] / seconds, (1.0 - point.a[v, v]) / seconds
@@ -104,6 +114,24 @@ def _strength(point: LinearModel, row: int, u: int) -> float:
     return float(arrived[row])
 
 
+def _slow(point: LinearModel, y: int, u: int) -> tuple[float, float]:
+    """Effect per second and decay per second of a first-order lag with the same step response.
+
+    Both are 0 where the component does not come to rest.
+    """
+    state, response = np.zeros(len(point.a)), []
+    for _ in range(_LONG):
+        state = point.a @ state + point.b[:, u]
+        response.append(state[y])
+    way = np.array(response)
+    ended = np.isfinite(way).all() and abs(way[-1] - way[_LONG // 2]) <= 1e-3 * abs(way[-1])
+    if not ended or abs(way[-1]) <= _NOTHING:
+        return 0.0, 0.0
+    steps = 1 + int(np.argmax(way / way[-1] >= 1.0 - np.exp(-1.0)))
+    decay = 1.0 / (steps * point.task.time_step)
+    return float(way[-1]) * decay, decay
+
+
 def _peak(
     point: LinearModel, places: tuple[int, int | None, int], gains: tuple[float, float, float]
 ) -> float | None:
@@ -134,17 +162,29 @@ def _peak(
     return float((1.0 / np.abs(1.0 + loop)).max())
 
 
-def pair(point: LinearModel, ranges: Matrix) -> dict[str, str]:
-    """The component that each action moves most, in units of its range; one for each action."""
+def pair(
+    point: LinearModel, ranges: Matrix, components: Sequence[str] | None = None
+) -> dict[str, str]:
+    """The component that each action moves most, in units of its range; one for each action.
+
+    Args:
+        point: the linear model.
+        ranges: half-range of each component.
+        components: those that are to be controlled. By default all that are no velocities.
+    """
     system = point.task.system
     own = [name for name in system.state_names if name not in system.velocity_of.values()]
+    own = own if components is None else list(components)
     moved = {}
     for name in own:
         velocity = system.velocity_of.get(name, name)
         row = system.state_names.index(velocity)
         unit = ranges[system.state_names.index(name)]
         for j, action in enumerate(system.action_names):
-            moved[name, action] = abs(_strength(point, row, j)) / unit
+            strength = _strength(point, row, j)
+            if not abs(strength) > _NOTHING and velocity == name:
+                strength = _slow(point, row, j)[0] * point.task.time_step
+            moved[name, action] = abs(strength) / unit
     pairs: dict[str, str] = {}
     for (name, action), strength in sorted(moved.items(), key=lambda each: -each[1]):
         if strength > 0 and action not in pairs and name not in pairs.values():

@@ -31,6 +31,16 @@ class Tank(System):
         return 2.0 * action - 0.5 * state
 
 
+class TwoTanks(System):
+    """A tank that is filled through another one, so that the inflow reaches it late."""
+
+    state_names, action_names = ("level", "upper"), ("inflow",)
+
+    def prior(self, state: Tensor, action: Tensor, constants) -> Tensor:
+        level, upper = state.unbind(-1)
+        return torch.stack([2.0 * upper - 0.5 * level, action[..., 0] - 2.0 * upper], -1)
+
+
 class Stray(Slider):
     """A slider beside a clock that grows by itself, which the force does not reach."""
 

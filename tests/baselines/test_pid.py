@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
 
 from phihp_torchrl import ConfigError, HybridDynamics, get_task
 from phihp_torchrl.baselines import PID
-from phihp_torchrl.tasks import Actuator
+from phihp_torchrl.tasks import Actuator, Signal
 
-from .parts import Slider, Tank, play, prior_of, task_of
+from .parts import Slider, Stray, Tank, TwoTanks, play, prior_of, task_of
 
 
 class Leak(Tank):
@@ -102,3 +104,47 @@ def test_what_is_wrong_is_named() -> None:
     late = task_of(Slider(), Actuator(delay_steps=9.0))
     with pytest.raises(ConfigError, match="component: expected a loop that force can stabilise"):
         PID.from_model(late, prior_of(late), time_constant=0.2)
+
+
+# References.
+
+
+def follow(state, action, next_state, reference):
+    return -(next_state[..., 0] - reference[..., 0]).square()
+
+
+def following(system, name="level", **options):
+    """A task to keep a component at a reference between -1 and 3."""
+    return replace(
+        task_of(system), reward=follow, reference=Signal((name,), (-1.0,), (3.0,), **options)
+    )
+
+
+@pytest.mark.parametrize("preview", [0, 3])
+@pytest.mark.parametrize("system", [Tank(), TwoTanks()])
+def test_a_reference_is_its_set_point(system, preview: int) -> None:
+    task = following(system, preview=preview)
+    pid = PID.from_model(task, prior_of(task))
+    assert pid.components == {"inflow": "level"}
+    start = torch.zeros(2, system.state_dim)
+    wanted = torch.tensor([[0.5], [2.5]])
+    states = play(
+        pid, task, task.with_signals(task.at_rest(start), wanted.repeat(1, 1 + preview)), 200
+    )
+    torch.testing.assert_close(states[-1, :, :1], wanted, atol=1e-3, rtol=0.0)
+    assert (states[10, :, 0] - wanted[:, 0]).abs().min() > 1e-3
+
+
+def test_a_step_response_tunes_what_answers_late() -> None:
+    gains = PID.from_model(following(TwoTanks()), prior_of(task_of(TwoTanks()))).gains["inflow"]
+    # 2 / ((s + 2) (2 s + 1)) has a gain of 2, and does 63 % of its way after about 2.5 s.
+    lag, slope = 2.5, 2.0 / 2.5
+    assert gains.i == pytest.approx(1.0 / gains.time_constant**2 / slope, rel=0.1)
+    assert gains.p == pytest.approx((2.0 / gains.time_constant - 1.0 / lag) / slope, rel=0.1)
+    assert gains.peak <= 1.7
+
+
+def test_a_reference_that_nothing_moves_is_refused() -> None:
+    task = following(Stray(), "drift")
+    with pytest.raises(ConfigError, match="components: expected some that an action moves"):
+        PID.from_model(task, prior_of(task), goal=[0.0, 0.0, 0.0])
