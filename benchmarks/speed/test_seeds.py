@@ -8,16 +8,17 @@ from race import race
 from torch import Tensor
 
 from phihp_torchrl import HybridDynamics, get_task, load_config
-from phihp_torchrl.agents import TD3Update, make_td3_loss
-from phihp_torchrl.agents.equations import (
+from phihp_torchrl.agents import (
+    Networks,
+    TD3Update,
     actor_loss,
     adam_,
     adam_rates,
     critic_loss,
+    make_td3_loss,
     soft_update_,
     td3_target,
 )
-from phihp_torchrl.agents.update import Networks
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.imagination import Batch
 from phihp_torchrl.trainers import read_run_config

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from phihp_torchrl.agents.analytic_config import AnalyticConfig
 from phihp_torchrl.agents.analytic_update import AnalyticUpdate, Draws
-from phihp_torchrl.agents.equations import Layers, act, prepare, q_values, soft_update_
+from phihp_torchrl.agents.equations import (
+    Layers,
+    act,
+    actor_loss,
+    adam_,
+    adam_rates,
+    critic_loss,
+    prepare,
+    q_values,
+    soft_update_,
+    td3_target,
+)
 from phihp_torchrl.agents.networks import (
     Actor,
     QNetwork,

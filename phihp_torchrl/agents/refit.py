@@ -48,8 +48,8 @@ class RefitConfig:
     """When and how the critics are fitted to returns in the model.
 
     Args:
-        start: critic updates before the critics are first fitted to returns in the model; 0 for
-            one fit at the end only.
+        start: critic updates before the critics are first fitted to returns in the model, from
+            where learning then goes on; 0 for one fit at the end only.
         interval: critic updates between two such fits; 0 for no fit.
         transitions: number of actions whose returns are imagined.
         horizon: model steps in a return, after which the value of the critics is added, or their
@@ -67,7 +67,7 @@ class RefitConfig:
         [False, True, False, True, True]
     """
 
-    start: int = 4000
+    start: int = 0
     interval: int = 2000
     transitions: int = 16384
     horizon: Steps = 100
@@ -91,6 +91,17 @@ class RefitConfig:
         return updates >= total or (
             updates >= self.start > 0 and (updates - self.start) % self.interval == 0
         )
+
+    def fits(self, total: float) -> float:
+        """How many fits there are in ``total`` updates, about.
+
+        Examples:
+            >>> RefitConfig().fits(9000), RefitConfig(start=4000, interval=2000).fits(9000)
+            (1.0, 3.5)
+        """
+        if not self.interval:
+            return 0.0
+        return 1.0 + (max(0.0, total - self.start) / self.interval if self.start else 0.0)
 
 
 class Refit(NamedTuple):

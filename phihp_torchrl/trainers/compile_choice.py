@@ -149,8 +149,7 @@ def _policy(config: RunConfig, settings: Any, world: World) -> Earned:
     played = settings.evaluation_steps or steps
     saved += updates / settings.evaluation_interval * worlds * played * _STEP
     if refit.interval:
-        fits = 1 + max(0.0, updates - refit.start) / refit.interval
-        saved += fits * (refit.horizon * _STEP + refit.steps * _GRADIENT)
+        saved += refit.fits(updates) * (refit.horizon * _STEP + refit.steps * _GRADIENT)
         taken += _GRADIENT_SECONDS
     return Earned(saved / 1e3, taken)
 
@@ -163,9 +162,7 @@ def _policy_steps(config: RunConfig, settings: Any, world: World) -> float:
     if settings.method == "td3":
         plan = SEARCH.planning_horizon * SEARCH.optim_steps
         calls += updates / settings.updates_per_step * (1 + _planned(settings) * plan)
-    if refit.interval:
-        calls += (1 + max(0.0, updates - refit.start) / refit.interval) * refit.horizon
-    return calls
+    return calls + refit.fits(updates) * refit.horizon
 
 
 def _planned(settings: Any) -> float:

@@ -115,14 +115,12 @@ def start_at_goal(config: PolicyConfig, task: Task) -> PolicyConfig:
         return config
     kind = "rewarding" if task.goal is None else "goal"
     start = replace(config.start, reset=0.2, coverage=0.2, data=0.0, goal=0.0, rewarding=0.0)
-    every, end = config.evaluation_interval, (1.0 + config.extension) * config.updates
-    refit = replace(config.refit, start=every * math.ceil(end / every))
     return replace(
         look_further(config, task),
         start=replace(start, **{kind: 0.6}),
         num_worlds=_WORLDS * config.num_worlds,
         planned=config.planned / _WORLDS,
-        refit=refit,
+        refit=replace(config.refit, start=0),
     )
 
 

@@ -165,8 +165,9 @@ def test_when():
     at_the_end = RefitConfig(start=0, interval=2)
     assert [n for n in range(11) if at_the_end.is_due(n, total=9)] == [9, 10]
     assert not any(RefitConfig(interval=0).is_due(n, total=9) for n in range(11))
-    due = [n for n in range(0, 9500, 500) if RefitConfig().is_due(n, total=9000)]
-    assert due == [4000, 6000, 8000, 9000]
+    assert [n for n in range(0, 9500, 500) if RefitConfig().is_due(n, total=9000)] == [9000]
+    counts = [of.fits(total=9) for of in (config, at_the_end, RefitConfig(interval=0))]
+    assert counts == [3.5, 1.0, 0.0]
 
 
 @pytest.mark.parametrize(
