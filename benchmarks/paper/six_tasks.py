@@ -52,10 +52,17 @@ def chatter(run: Run, name: str) -> float:
 def seconds_until(run: Run, level: float) -> float:
     """Seconds of the run until its actor first earned ``level`` in the world; infinite if never.
 
-    The world's returns are logged with each evaluation and choose nothing.
+    The world's returns are logged with each evaluation in the phase policy, and choose nothing.
     """
-    reached = (p.seconds for p in run.curve if p.acting == "actor" and p.return_mean >= level)
-    return next(iter(reached), math.inf)
+    learning = (p for p in run.curve if p.phase == "policy" and p.acting == "actor")
+    return next((p.seconds for p in learning if p.return_mean >= level), math.inf)
+
+
+def times(runs: Sequence[Run], level: float) -> str:
+    """The mean of these seconds over the runs that got there, and how many did, if not all."""
+    reached = [t for run in runs if (t := seconds_until(run, level)) < math.inf]
+    mean = f"{sum(reached) / len(reached):.0f}" if reached else "–"
+    return mean if len(reached) == len(runs) else f"{mean} ({len(reached)} of {len(runs)})"
 
 
 def spread(values: Sequence[float], digits: int) -> str:
@@ -75,7 +82,6 @@ def row(task: str, runs: Sequence[Run]) -> list[str]:
         return [value(run) for run in runs]
 
     published = PUBLISHED.get(task, {}).get("PhIHP")
-    times = [] if published is None else each(lambda r: seconds_until(r, published.return_mean))
     return [
         task,
         str(len(runs)),
@@ -85,7 +91,7 @@ def row(task: str, runs: Sequence[Run]) -> list[str]:
         spread(each(lambda run: run.acting["actor"].mean), 1),
         spread(each(lambda run: chatter(run, agent_in(run.acting))), 3),
         spread(each(lambda run: chatter(run, "actor")), 3),
-        f"{sum(times) / len(times):.0f}" if times else "–",
+        "–" if published is None else times(runs, published.return_mean),
         f"{sum(each(lambda run: sum(run.seconds.values()))) / len(runs):.0f}",
     ]
 
@@ -109,7 +115,8 @@ def page(runs: Sequence[Run]) -> str:
         "the action from step to step in the second half of an episode, in half-ranges. *aim* is "
         "the return of version 0.1.0. *s to published* are the seconds of a run, its real steps "
         "and the fits of its model among them, until the actor first earned the published mean "
-        "return of PhIHP in ten episodes of the world, and inf where it never did; *s in all* has "
+        "return of PhIHP in ten episodes of the world, a mean over the runs in which it did (how "
+        "many, if not all); *s in all* has "
         "calibration and the evaluation of 50 episodes too. Brackets are 95 % intervals over "
         "training seeds.\n\n"
         f"{markdown_table(header, rows)}\n"

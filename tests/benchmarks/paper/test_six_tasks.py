@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 from kept_runs import make_run
 
 import six_tasks
+from measures import CurvePoint
 from report.runs import read_runs
 
 
@@ -45,7 +47,12 @@ def test_time_to_the_published_return_is_that_of_the_first_actor_to_earn_it(tmp_
     make_run(tmp_path, seed=100, curve=curve)
     run = read_runs(tmp_path).runs[0]
     assert six_tasks.seconds_until(run, -263.0) == 1.0
-    assert six_tasks.seconds_until(run, -100.0) == math.inf
+    last = CurvePoint("evaluate", 1000, 9.0, "actor", -50.0)
+    evaluated = replace(run, curve=(*run.curve, last))
+    assert six_tasks.seconds_until(evaluated, -100.0) == math.inf, "the final evaluation is none"
+    assert six_tasks.times([run], -263.0) == "1"
+    make_run(tmp_path, seed=101, curve=curve[:1])
+    assert six_tasks.times(read_runs(tmp_path).runs, -263.0) == "1 (1 of 2)"
     page = six_tasks.page([run])
     assert "Training seeds 100." in page
     assert "Not run yet: pendulum-swingup" in page
