@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import torch
 from torch import Tensor, nn
 
@@ -9,6 +11,8 @@ from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment.agent import Agent
 from phihp_torchrl.planners import CEMPlanner, cem_plan, colored
 from phihp_torchrl.tasks import Task
+
+_logger = logging.getLogger(__name__)
 
 
 class ExportModule(nn.Module):
@@ -47,7 +51,7 @@ class PlanModule(ExportModule):
     It reads an observation ``[o]`` and standard normal noise of shape ``noise_shape``, and returns
     an action ``[m]``. It draws no random numbers and keeps no plan between steps, so it plans at
     every step, regardless of ``replan_every``, ``warm_start`` and ``keep_incumbent``, and the first
-    action of a plan has no ``change_cost``.
+    action of a plan has no ``change_cost``. A warning says which of these the agent has.
 
     Args:
         agent: an agent that plans by a :class:`~phihp_torchrl.CEMPlanner`.
@@ -80,7 +84,18 @@ class PlanModule(ExportModule):
             )
         if not getattr(planner.env.tensor_model, "compiles", True):
             raise ConfigError("agent", "expected a model whose integrator compiles, got another.")
-        shape = planner.settings.noise_shape((), agent.task.action_dim)
+        settings = planner.settings
+        lost = [name for name in ("warm_start", "keep_incumbent", "change_cost")
+                if getattr(settings, name)]  # fmt: skip
+        lost += ["replan_every"] if settings.replan_every != 1 else []
+        if lost:
+            _logger.warning(
+                "A plan that is exported keeps nothing from one step to the next, so it may change "
+                "its action more than the agent does: %s of the planner has no effect in it. "
+                "save_agent(agent, path, packaged=True) keeps all.",
+                " and ".join(lost),
+            )
+        shape = settings.noise_shape((), agent.task.action_dim)
         super().__init__(agent.task, shape)
         self.planner = planner  # whose parameters are then this module's
         # The first call keeps the filter of this shape, which an export then takes as a constant.

@@ -104,6 +104,14 @@ def test_what_cannot_be_exported():
         PlanModule(make_agent(dynamics=world.oracle()))
 
 
+def test_what_a_plan_by_itself_cannot_keep_is_said(caplog):
+    PlanModule(make_agent())
+    assert caplog.text == ""
+    calm = replace(TINY, warm_start=True, change_cost=0.5)
+    PlanModule(make_agent(config=calm))
+    assert "warm_start and change_cost of the planner has no effect" in caplog.text
+
+
 def test_the_command_says_what_failed(tmp_path, monkeypatch, capsys):
     save_agent(make_agent(), tmp_path / "agent")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
