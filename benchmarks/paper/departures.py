@@ -44,7 +44,7 @@ TOGETHER = {"model.fit.method": ("model.fit.steps", "model.warm_start")}
 LEFT_OUT = (
     "model.real_steps",  # results/README.md has a table of it
     "policy.updates",  # takes hours; preset=paper has it
-    "policy.evaluation_interval",  # longer than the default's refits are apart
+    "policy.evaluation_interval",  # more than the default's updates in all, on some tasks
     "model.fit.steps",  # with model.fit.method
 )
 """Settings that are not measured, or not alone."""

@@ -39,7 +39,6 @@ SETTINGS = {
     "policy.evaluation_interval": 500,
     "policy.td3.actor_hidden_sizes": [64, 64],
     "policy.td3.critic_hidden_sizes": [64, 64],
-    "policy.refit.start": 0,
     "evaluate.baselines": ["lqr", "pid"],
     "evaluate.latency_actions": 0,
     "evaluate.video": False,

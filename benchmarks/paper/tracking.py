@@ -49,7 +49,6 @@ SETTINGS = {
     "policy.evaluation_steps": 250,
     "policy.strategies": "none",
     "policy.real_evaluation_episodes": 0,
-    "policy.refit.start": 0,
     "evaluate.episodes": 2,
     "evaluate.latency_actions": 0,
     "evaluate.video": False,

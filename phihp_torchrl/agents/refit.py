@@ -50,7 +50,8 @@ class RefitConfig:
     Args:
         start: critic updates before the critics are first fitted to returns in the model, from
             where learning then goes on; 0 for one fit at the end only.
-        interval: critic updates between two such fits; 0 for no fit.
+        interval: critic updates between two such fits, and any number above 0 for the one at the
+            end; 0 for no fit.
         transitions: number of actions whose returns are imagined.
         horizon: model steps in a return, after which the value of the critics is added, or their
             duration, such as "4 s".

@@ -85,7 +85,8 @@ class PID(Controller):
             task: the task.
             dynamics: the model, ``(state, action) -> next state``.
             goal: the state with the set points. Defaults to the task's goal; for a task with a
-                reference to the middle of that, and of the wide box in all else.
+                reference to the middle of that, with the other components at which the model rests
+                there, sought from the middle of the wide box.
             components: component of the state by name of the action. By default each action has
                 the one that it moves most, in units of the half-range of the task's wide box, of
                 those of the reference if there is one.

@@ -86,7 +86,7 @@ def linearise(
     registers: bool = True,
     follows: Sequence[str] = (),
 ) -> LinearModel:
-    """The linear model of one step at the goal: slopes of the model, of states across secants.
+    """The linear model of one step at the goal: derivatives by actions, secants by components.
 
     Args:
         task: the task.
@@ -94,10 +94,10 @@ def linearise(
         goal: the physical state at which to linearise. Defaults to the task's goal: the centre of
             its box ``goal``, or else a state at rest whose reward no state of the wide box exceeds.
         registers: whether the task's registers, such as commands under way and the last action,
-            belong to the state. With an estimated disturbance they are left out, and with a
-            reference.
+            belong to the state, those of a reference apart. With an estimated disturbance they are
+            left out.
         follows: components that follow the task's reference, and have the values of ``goal``; the
-            others are those at which the model rests there.
+            others are those at which the model rests there, sought from ``goal``.
 
     Raises:
         ConfigError: where there is no such state, or the model does not rest in it, and for a task
@@ -111,8 +111,7 @@ def linearise(
     state, action = _rest(task, step, goal, follows)
     at, move = state, step
     # An estimated disturbance is no action's to move.
-    alone = task.disturbance is None and task.reference is None
-    if registers and task.register_count and alone:
+    if registers and task.register_count and task.disturbance is None:
         at = torch.cat([state, task.registers.rest(action)])
         move = _with_registers(task, step)
     with torch.no_grad():
@@ -120,6 +119,11 @@ def linearise(
         a = _with_secants(task, move, at, action, slope_a)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise ConfigError("dynamics", "expected finite derivatives at the goal, got others.")
+    if len(at) > len(state) and task.outside is not None:  # these are the first of the registers
+        outside = slice(len(state), len(state) + task.outside.size)
+        at = torch.cat([at[: outside.start], at[outside.stop :]])
+        a, b = np.delete(a, outside, 0), np.delete(b, outside, 0)
+        a = np.delete(a, outside, 1)
     return LinearModel(task, at, action, a, b)
 
 
@@ -155,7 +159,7 @@ def _with_registers(task: Task, step: Step) -> Step:
 def _rest(
     task: Task, step: Step, goal: Sequence[float] | None, follows: Sequence[str] = ()
 ) -> tuple[Tensor, Tensor]:
-    """The goal, and the action that keeps it."""
+    """The goal, with what is sought in it, and the action that keeps it."""
     free = [i for i, name in enumerate(task.system.state_names) if follows and name not in follows]
     if goal is not None:
         if len(goal) != task.system.state_dim:
@@ -187,7 +191,7 @@ def _rest(
 def _trim(
     task: Task, step: Step, start: Tensor, free: Sequence[int] = ()
 ) -> tuple[Tensor, Tensor, float]:
-    """The action ``[m]`` that keeps a state best, and how far it still moves in a step.
+    """A state, the action ``[m]`` that keeps it best, and how far it still moves in a step.
 
     Components that are ``free`` are sought with the action, from their values at the start.
     """

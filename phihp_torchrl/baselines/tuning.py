@@ -16,6 +16,8 @@ _TIMES = np.geomspace(1.5, 200.0, 40)
 """Time constants that are tried, in time steps."""
 _NOTHING = 1e-9
 """Effect of an action, per second, that is none."""
+_DIRECT = 0.5
+"""Share of the effect by the step response, below which that at once is not what is meant."""
 _LONG = 5000
 """Steps in which a step response has to end."""
 
@@ -52,9 +54,9 @@ def tune(
     in discrete time and with the registers of an actuator: the shortest λ is taken whose loop is
     stable and whose sensitivity peaks below 1.7, or else the stable one with the lowest peak.
 
-    A component without a velocity that the action moves through another one, such as the speed of a
-    motor through its current, is first order by its step response: its gain, and the time in which
-    it does 63 % of its way.
+    A component without a velocity that the action moves mostly through another one, such as the
+    speed of a motor through its current, is first order by its step response: its gain, and the
+    time in which it does 63 % of its way.
 
     Args:
         point: the linear model at the set point.
@@ -69,10 +71,7 @@ def tune(
     y, u = system.state_names.index(component), system.action_names.index(action)
     velocity = system.velocity_of.get(component)
     v = None if velocity is None else system.state_names.index(velocity)
-    row = y if v is None else v
-    strength, decay = _strength(point, row, u) / seconds, (1.0 - point.a[y, y]) / seconds
-    if v is None and not abs(strength) > _NOTHING:
-        strength, decay = _slow(point, y, u)
+    strength, decay = _answer(point, component, u)
     if not abs(strength) > _NOTHING:
         raise ConfigError(
             "component", f"expected one that {action} moves, {component!r} does not answer to it."
@@ -99,6 +98,23 @@ def tune(
             f"every time constant tried, {times[0]:.3g} s to {times[-1]:.3g} s.",
         )
     return min(tried, key=lambda gains: max(gains.peak, _PEAK))
+
+
+def _answer(point: LinearModel, component: str, u: int) -> tuple[float, float]:
+    """How an action moves a component or its velocity, and how these decay, both per second.
+
+    A residual that was learned moves everything a little at once, so that a step response decides
+    which way is meant.
+    """
+    system, seconds = point.task.system, point.task.time_step
+    velocity = system.velocity_of.get(component)
+    row = system.state_names.index(component if velocity is None else velocity)
+    direct = _strength(point, row, u) / seconds
+    if velocity is None:
+        slow, decay = _slow(point, row, u)
+        if abs(direct) < _DIRECT * abs(slow):
+            return slow, decay
+    return direct, (1.0 - point.a[row, row]) / seconds
 
 
 def _strength(point: LinearModel, row: int, u: int) -> float:
@@ -177,16 +193,11 @@ def pair(
     own = own if components is None else list(components)
     moved = {}
     for name in own:
-        velocity = system.velocity_of.get(name, name)
-        row = system.state_names.index(velocity)
         unit = ranges[system.state_names.index(name)]
         for j, action in enumerate(system.action_names):
-            strength = _strength(point, row, j)
-            if not abs(strength) > _NOTHING and velocity == name:
-                strength = _slow(point, row, j)[0] * point.task.time_step
-            moved[name, action] = abs(strength) / unit
+            moved[name, action] = abs(_answer(point, name, j)[0]) / unit
     pairs: dict[str, str] = {}
     for (name, action), strength in sorted(moved.items(), key=lambda each: -each[1]):
-        if strength > 0 and action not in pairs and name not in pairs.values():
+        if strength > _NOTHING and action not in pairs and name not in pairs.values():
             pairs[action] = name
     return pairs

@@ -224,8 +224,10 @@ class CalibratePhase:
         if contest.next_way is None:
             contest.keep(choice.name)
             same = choice.gain == choice.gain_error == 0.0
-            known = same or (choice.certain and contest.episodes >= _KNOWN)
+            enough = contest.episodes >= min(_KNOWN, self.config.max_episodes)
+            known = same or (choice.certain and enough)
             if known or not contest.double():
+                choice = choice._replace(certain=known)
                 self._settle(choice)
         return choice
 
@@ -239,14 +241,13 @@ class CalibratePhase:
             self._finish(choice)
 
     def _finish(self, choice: Choice) -> None:
-        """Record the choice, on the fast budget if that has played and loses nothing."""
+        """Record the choice, on the fast budget if that loses nothing and beats the actor too."""
         ways, actor = self.contest.all_ways(), self.contest.actor(self.contest.episodes)
-        fast = _FAST in ways and loses_nothing(ways[_FAST], ways[choice.name])
-        if fast:
-            gain, error = ways[_FAST].ahead_of(actor)
-            choice = choice._replace(name=_FAST, gain=gain, gain_error=error)
+        if _FAST in ways and loses_nothing(ways[_FAST], ways[choice.name]):
+            fast = choose({_FAST: ways[_FAST]}, actor, confidence=self.config.confidence)
+            choice = fast if fast.acting == "planner" else choice
         models = {"models_disagree": self.doubted, "actor_elsewhere": self.elsewhere}
-        budget = {"budget": _FAST if fast else "full"}
+        budget = {"budget": _FAST if choice.name == _FAST else "given"}
         self.final = summary(choice, ways, actor) | budget | models
         report(self.final)
         if self.path is not None:

@@ -14,15 +14,18 @@ class CalibrateConfig:
     Args:
         enabled: whether to calibrate; false takes the settings of the section planner as they are,
             and the run has no such phase.
-        episodes: paired imagined episodes of each way to plan; the one that is chosen plays more.
+        episodes: paired imagined episodes of each way to plan; the one that is chosen may play
+            more.
         confidence: standard errors by which one way to plan must beat another, and by which one of
             plan and actor beats the other without doubt.
-        max_episodes: episodes at most; their number doubles while it is in doubt who is to act.
+        max_episodes: episodes at most; their number doubles up to twelve, and while it is in doubt
+            who is to act.
         budget: transitions that plans may imagine, three fifths of them before a way is chosen; a
             call of the model counts as a thousand more, and one of a network as one for each ten
             thousand weights, so a million takes about half a second of one core. Transitions of a
             model whose step has over 60 tensor operations count more in proportion. Three episodes
-            of two ways to plan, and six of the one that is chosen, are played in any case.
+            of two ways to plan, six of the one that is chosen, and those on the fast budget are
+            played in any case.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.

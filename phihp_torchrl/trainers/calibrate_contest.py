@@ -101,8 +101,9 @@ class Contest:
         """
         more = min(self.episodes, self.config.max_episodes - self.episodes)
         cost = len(self.playing) * self._cost(more, self._length)
-        dear = self.spent + cost > self.config.budget
-        if more < 1 or (dear and self.episodes + more > _ALONE):
+        if self.spent + cost > self.config.budget:
+            more = min(more, _ALONE - self.episodes)
+        if more < 1:
             return False
         self.episodes += more
         return True

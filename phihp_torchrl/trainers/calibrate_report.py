@@ -78,6 +78,7 @@ def _row(way: Way, actor: Way) -> dict[str, Any]:
     gain, error = way.ahead_of(actor)
     return {
         "changes": dict(way.changes),
+        "episodes": len(way.returns),
         "return": way.mean_return,
         "chatter": way.mean_chatter,
         "gain": gain,

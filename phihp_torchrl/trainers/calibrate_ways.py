@@ -16,7 +16,7 @@ _NOTHING = 1e-3
 # A search that goes on from the previous plan, and keeps it unless another is better.
 _STANDING = {"noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
 # What a plan has at most on the fast budget (config/settings/budget/fast.yaml).
-_FAST = {
+_FAST_LIMITS = {
     "planning_horizon": 3,
     "optim_steps": 2,
     "num_candidates": 32,
@@ -91,7 +91,8 @@ def faster(config: SearchConfig, changes: Mapping[str, Any]) -> dict[str, Any]:
         changes: those of the way, which it keeps.
 
     Returns:
-        The changes; none where the way is as cheap already.
+        The changes; none where the way is as cheap already, or where other settings, such as more
+        kept elites than there are elites, do not fit them.
 
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig
@@ -101,7 +102,7 @@ def faster(config: SearchConfig, changes: Mapping[str, Any]) -> dict[str, Any]:
         {}
     """
     known = {field.name for field in fields(config)}
-    less = {name: most for name, most in _FAST.items() if name in known}
+    less = {name: most for name, most in _FAST_LIMITS.items() if name in known}
     less = {name: most for name, most in less.items() if getattr(config, name) > most}
     cheap = _fitting(config, {**changes, **less})
     return cheap if less else {}

@@ -181,8 +181,7 @@ class PolicyTrainer:
     @property
     def done(self) -> bool:
         """Whether the updates are made, as many as they now are, or the seconds are spent."""
-        limit = self.config.max_seconds
-        return self.updates >= self.schedule.end or (limit is not None and self.seconds > limit)
+        return self.updates >= self.schedule.end or self._is_over(self.seconds)
 
     @torch.no_grad()
     def advance(self) -> dict[str, float]:
@@ -217,9 +216,17 @@ class PolicyTrainer:
             metrics["policy/end"] = float(self.schedule.end)
         if config.refit.is_due(self.updates, self.schedule.end):
             metrics |= self._refit_critics()
+        elif self._is_over(self.seconds + time.perf_counter() - start):
+            metrics |= self.finish()
         metrics |= self.evaluation.real(self.update.networks.actor)
         self.seconds += time.perf_counter() - start
         return {**metrics, "policy/seconds": self.seconds}
+
+    def finish(self) -> dict[str, float]:
+        """Fit the best actor's critics, if that is set and not done; returns what to log."""
+        if not self.config.refit.interval or self._is_fitted or self.best_return == -math.inf:
+            return {}
+        return self._refit_critics()
 
     def floor(self, states: Tensor, steps: int, seed: int) -> Floor:
         """The floor of returns of ``steps`` steps from these states, in the units of training."""
@@ -282,6 +289,11 @@ class PolicyTrainer:
         self._is_fitted = state.get("is_fitted", False)  # older checkpoints fit again
         self.evaluation.states = state["evaluation_states"]
         self.evaluation.world_states = state["world_states"]
+
+    def _is_over(self, seconds: float) -> bool:
+        """Whether the seconds are spent."""
+        limit = self.config.max_seconds
+        return limit is not None and seconds > limit
 
     def _keep(self, layers: list[Tensor]) -> None:
         for kept, layer in zip(self.best, layers, strict=True):

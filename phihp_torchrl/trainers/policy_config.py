@@ -169,7 +169,7 @@ class PolicyConfig:
                     f"expected a multiple of td3.policy_delay = {self.td3.policy_delay}, "
                     f"got {value}.",
                 )
-        for name in ("start", "interval") if self.refit.interval else ():
+        for name in ("start", "interval") if self.refit.interval and self.refit.start else ():
             value = getattr(self.refit, name)
             if value % self.evaluation_interval:
                 raise ConfigError(

@@ -231,6 +231,7 @@ class PolicySearch:
             stuck = share >= _HALF_WAY and self._share_of_lives(steps) >= _HALF_WAY
         if at_end or stuck:
             if self.best is None or score >= self.best.score:
+                trainer.finish()
                 self.best = self._present(score)
                 self.stuck = share > _AT_END
             self._end(stuck, share, score)

@@ -19,7 +19,6 @@ from phihp_torchrl.trainers.stored import read_stored
 _BEFORE = {
     ("model", "fit", "shuffle_actions"): False,
     ("policy", "refit", "interval"): 0,
-    ("policy", "refit", "start"): 0,
     ("policy", "extension"): 0.0,
     ("policy", "planned"): 0.0,
 }

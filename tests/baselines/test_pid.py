@@ -144,6 +144,29 @@ def test_a_step_response_tunes_what_answers_late() -> None:
     assert gains.peak <= 1.7
 
 
+def test_a_residual_that_moves_all_at_once_does_not_hide_the_way_through_another() -> None:
+    task = following(TwoTanks())
+    torch.manual_seed(0)
+    learned = HybridDynamics.hybrid(task)
+    with torch.no_grad():
+        for weight in learned.residual.parameters():
+            weight.mul_(0.3)
+    found, prior = (
+        PID.from_model(task, model).gains["inflow"] for model in (learned, prior_of(task))
+    )
+    assert found.i == pytest.approx(prior.i, rel=0.3)
+
+
+def test_dead_time_is_in_the_model_of_a_task_with_a_reference() -> None:
+    late = replace(following(Tank(), preview=2), actuator=Actuator(delay_steps=3.0))
+    pid = PID.from_model(late, prior_of(late))
+    prompt = PID.from_model(following(Tank()), prior_of(following(Tank())))
+    assert pid.gains["inflow"].time_constant > 1.5 * prompt.gains["inflow"].time_constant
+    start = late.with_signals(late.at_rest(torch.zeros(1, 1)), torch.full((1, 3), 2.5))
+    states = play(pid, late, start, 200)
+    assert (states[100:, 0, 0] - 2.5).abs().max() < 0.01
+
+
 def test_a_reference_that_nothing_moves_is_refused() -> None:
     task = following(Stray(), "drift")
     with pytest.raises(ConfigError, match="components: expected some that an action moves"):

@@ -179,6 +179,19 @@ def test_the_budget_ends_doubt_and_leaves_ways_out():
     assert small.final["certain"] is False
 
 
+@pytest.mark.parametrize("first", [3, 4, 5])
+def test_a_chosen_way_plays_six_episodes_whatever_they_cost(first):
+    config = replace(TINY, episodes=first, max_episodes=48, budget=1, confidence=1e6)
+    contest = CalibratePhase(make_agent(), config, seed=0).contest
+    contest.begin({"given": {}})
+    contest.episodes = first
+    contest.play("given")
+    assert contest.double()
+    contest.play("given")
+    assert len(contest.way("given").returns) == 6
+    assert not contest.double()
+
+
 def test_dear_plans_begin_with_fewer_episodes():
     price, config = Price(SMALL), replace(TINY, episodes=6)
 
@@ -233,6 +246,8 @@ def test_a_gain_in_a_few_episodes_is_not_certain_yet(monkeypatch):
     monkeypatch.setattr(calibrate_module, "choose", lambda ways, actor, **_: sure)
     config = replace(TINY, max_episodes=48)
     assert finished(make_agent(), config).final["episodes"] == 12
+    poor = finished(make_agent(), replace(config, budget=1)).final
+    assert (poor["episodes"], poor["certain"]) == (6, False)
     same = sure._replace(acting="actor", gain=0.0, gain_error=0.0)
     monkeypatch.setattr(calibrate_module, "choose", lambda ways, actor, **_: same)
     assert finished(make_agent(), config).final["episodes"] == 3
@@ -261,17 +276,29 @@ def test_where_plans_promise_much_beyond_an_actor_that_rests_all_ways_may_play(m
 WIDE = replace(SMALL, num_candidates=64)
 
 
-@pytest.mark.parametrize("loses", [True, False])
-def test_a_plan_that_acts_keeps_the_fast_budget_if_it_loses_nothing(monkeypatch, tmp_path, loses):
-    chosen = Choice("leaving", "planner", True, 1.0, 0.1)
-    monkeypatch.setattr(calibrate_module, "choose", lambda ways, actor, **_: chosen)
+def choosing_the_first(behind=()):
+    """The first way acts, but for those that are behind the actor."""
+
+    def choose(ways, actor, **_):
+        name = next(iter(ways))
+        return Choice(name, "actor" if name in behind else "planner", True, 1.0, 0.1)
+
+    return choose
+
+
+@pytest.mark.parametrize(("loses", "behind"), [(True, ()), (False, ("fast",)), (False, ())])
+def test_a_plan_that_acts_keeps_the_fast_budget_if_it_loses_nothing(
+    monkeypatch, tmp_path, loses, behind
+):
+    monkeypatch.setattr(calibrate_module, "choose", choosing_the_first(behind))
     monkeypatch.setattr(calibrate_module, "loses_nothing", lambda cheap, plan: not loses)
+    loses = loses or behind
     phase = finished(make_agent(planner=WIDE), path=tmp_path / "table.json")
     table = json.loads((tmp_path / "table.json").read_text())
     assert list(table["ways"])[-1] == "fast"
-    assert table["budget"] == ("full" if loses else "fast")
+    assert table["acting"] == "planner"
+    assert table["budget"] == ("given" if loses else "fast")
     assert table["way"] == ("leaving" if loses else "fast")
-    assert table["gain"] == (1.0 if loses else table["ways"]["fast"]["gain"])
     assert phase.planner_config.num_candidates == (64 if loses else 32)
     # It plays as the chosen way does.
     assert phase.planner_config.actor_margin == table["ways"]["leaving"]["changes"]["actor_margin"]
@@ -286,12 +313,11 @@ def test_where_the_actor_acts_or_plans_are_cheap_none_is_played_faster(
     monkeypatch.setattr(calibrate_module, "choose", lambda ways, actor, **_: chosen)
     final = finished(make_agent(planner=planner)).final
     assert "fast" not in final["ways"]
-    assert final["budget"] == "full"
+    assert final["budget"] == "given"
 
 
 def test_an_interrupted_phase_goes_on_with_the_fast_budget(monkeypatch):
-    chosen = Choice("leaving", "planner", True, 1.0, 0.1)
-    monkeypatch.setattr(calibrate_module, "choose", lambda ways, actor, **_: chosen)
+    monkeypatch.setattr(calibrate_module, "choose", choosing_the_first())
     agent = make_agent(planner=WIDE)
     begun, resumed = (CalibratePhase(agent, TINY, seed=0) for _ in range(2))
     while begun.chosen is None:

@@ -70,7 +70,7 @@ def test_a_smooth_one_has_the_benefit_of_doubt_until_it_looks_twice_as_dear() ->
         assert pick(given, smooth).name == name
 
 
-def test_where_the_plan_gains_nothing_smoothness_must_be_free() -> None:
+def test_at_a_return_of_nothing_smoothness_must_be_free() -> None:
     given = way(-1.0, 1.0, -1.0, 1.0)
     worse = way(-1.1, 0.9, -1.0, 0.9, chatter=0.0)
     assert pick(given, worse).name == "0"

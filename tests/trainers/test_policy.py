@@ -209,6 +209,18 @@ def test_rates_decay_at_the_end(monkeypatch):
     assert scales == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("limit", [None, 1e-9])
+def test_the_critics_are_fitted_at_the_end_also_where_the_seconds_are_spent(limit):
+    refit = RefitConfig(transitions=32, horizon=3, steps=2, batch_size=16)
+    trainer = policy_trainer(replace(POLICY, refit=refit, max_seconds=limit))
+    fitted = []
+    while not trainer.done:
+        fitted.append("policy/critic_error" in trainer.advance())
+    assert fitted == [False] * (len(fitted) - 1) + [True]
+    assert len(fitted) == (1 if limit else POLICY.updates // POLICY.evaluation_interval)
+    assert trainer.finish() == {}, "it is done"
+
+
 def test_critics_are_fitted_once_to_each_best_actor():
     refit = RefitConfig(start=4, interval=4, transitions=32, horizon=3, steps=2, batch_size=16)
     trainer = policy_trainer(replace(POLICY, updates=16, refit=refit))

@@ -76,9 +76,10 @@ def test_chunks_hold_whole_updates():
 
 def test_fits_of_critics_fall_on_evaluations():
     with pytest.raises(ConfigError, match=r"^refit\.interval: expected a multiple of evaluation"):
-        PolicyConfig(evaluation_interval=300, refit=RefitConfig(start=0, interval=500))
-    # Without fits there is nothing to fall on them.
-    PolicyConfig(evaluation_interval=300, refit=RefitConfig(interval=0))
+        PolicyConfig(evaluation_interval=300, refit=RefitConfig(start=600, interval=500))
+    # Without fits, or with one at the end, there is nothing to fall on them.
+    for refit in (RefitConfig(interval=0), RefitConfig(start=0, interval=500)):
+        PolicyConfig(evaluation_interval=300, refit=refit)
 
 
 def test_periods():
