@@ -14,7 +14,7 @@ from phihp_torchrl import HybridDynamics, Task, WorldModelEnv, get_task, load_co
 from phihp_torchrl.agents import make_actor, make_twin_qvalue
 from phihp_torchrl.config import read_kind, resolve_seconds
 from phihp_torchrl.dynamics import PreparedModel, TaskWorldModel
-from phihp_torchrl.planners import PLANNERS, CEMConfig, CEMPlanner
+from phihp_torchrl.planners import PLANNERS, CEMConfig, CEMPlanner, colored
 from phihp_torchrl.systems import System
 
 TASKS = ["pendulum", "cartpole", "cartpole-swingup", "acrobot", "acrobot-swingup"]
@@ -42,7 +42,8 @@ def both(planner, batch=(3,), seed=1, last=None):
     noise = torch.randn(s.noise_shape(batch, task.action_dim), generator=generator)
     mean = 0.1 * torch.randn(*batch, s.planning_horizon, task.action_dim, generator=generator)
     with torch.no_grad():
-        plain = planner._plan(observation, noise, mean, last, problem=planner.problem(), settings=s)
+        same = colored(noise, s.noise_beta, dim=1)
+        plain = planner._plan(observation, same, mean, last, problem=planner.problem(), settings=s)
     data = TensorDict(observation=observation, batch_size=batch)
     return plain, planner.plan(data, noise, mean, last)
 
