@@ -21,7 +21,7 @@ _WEIGHTS = 10_000
 # Episodes that each way plays in any case: below them a standard error says little.
 _LEAST = 3
 # What all ways may have of the budget. The rest is for the one that is chosen.
-_WAYS = 0.6
+_WAYS = 0.45
 
 
 @dataclass(frozen=True)
