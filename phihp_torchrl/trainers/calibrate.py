@@ -222,8 +222,7 @@ class CalibratePhase:
             contest.close()
         if contest.next_way is None:
             self.chosen = choice
-            same = choice.gain == choice.gain_error == 0.0
-            cheap = {} if self.doubted or same else faster(self.base, plan.changes)
+            cheap = {} if self.doubted or choice.is_tie else faster(self.base, plan.changes)
             if cheap:
                 contest.add(_FAST, cheap)
             else:
@@ -242,9 +241,8 @@ class CalibratePhase:
         actor, confidence = contest.actor(contest.episodes), self.config.confidence
         left = {name: contest.way(name)}
         choice = choose(left, actor, confidence=confidence, doubted=self.doubted)
-        same = choice.gain == choice.gain_error == 0.0
         enough = contest.episodes >= min(_KNOWN, self.config.max_episodes)
-        known = same or (choice.certain and enough)
+        known = choice.is_tie or (choice.certain and enough)
         if known or not contest.double():
             self._finish(choice._replace(certain=known))
         return choice

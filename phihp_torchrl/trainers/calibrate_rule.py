@@ -86,6 +86,11 @@ class Choice(NamedTuple):
     gain: float
     gain_error: float
 
+    @property
+    def is_tie(self) -> bool:
+        """Whether plan and actor earn exactly the same in each episode."""
+        return self.gain == self.gain_error == 0.0
+
 
 def choose(
     ways: Mapping[str, Way], actor: Way, *, confidence: float = 2.0, doubted: bool = False
