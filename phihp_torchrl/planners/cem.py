@@ -28,6 +28,10 @@ from phihp_torchrl.planners.candidates import (
 from phihp_torchrl.planners.choice import between, prefer
 from phihp_torchrl.planners.problem import Problem
 from phihp_torchrl.planners.search import SearchConfig
+from phihp_torchrl.tasks import ActionBounds
+
+# Mean change of an actor's sequence from step to step, in half-ranges, up to which it rests.
+_REST = 0.02
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class CEMConfig(SearchConfig):
             iteration, and the planner acts with it unless its plan has a higher score.
         actor_margin: least difference by which the score of the plan must be higher, in units of
             return.
+        margin_at_rest: whether that difference is asked for only where the actor's sequence rests:
+            where it changes by at most 0.02 of the half-range from step to step, on average.
         keep_incumbent: whether the previous plan, shifted and completed by an action of the actor,
             is a candidate in every iteration and is kept unless another plan has a higher score;
             the mean is then sought between it and the elites' mean. Needs warm_start.
@@ -65,6 +71,7 @@ class CEMConfig(SearchConfig):
     select: str = "mean"
     compare_with_actor: bool = True
     actor_margin: float = 0.0
+    margin_at_rest: bool = False
     keep_incumbent: bool = False
     incumbent_margin: float = 0.0
     replan_every: Steps = 1
@@ -78,7 +85,7 @@ class CEMConfig(SearchConfig):
         check_steps(self, "replan_every")
         if not in_seconds(self.replan_every):
             check_count(self, "replan_every", most="planning_horizon")
-        for name in ("compare_with_actor", "keep_incumbent", "warm_start"):
+        for name in ("compare_with_actor", "margin_at_rest", "keep_incumbent", "warm_start"):
             if not isinstance(value := getattr(self, name), bool):
                 raise ConfigError(name, f"expected true or false, got {value!r}.")
         if self.keep_incumbent and not self.warm_start:
@@ -209,7 +216,8 @@ def cem_plan(
     if compare:
         # The actor's sequence, unless the plan is better; the best candidate if its score is bad.
         rival = own.where(own.scores > BAD, best)
-        chosen = chosen.where(chosen.scores > own.scores + s.actor_margin, rival)
+        margin = s.actor_margin * _rests(own.actions, bounds) if s.margin_at_rest else s.actor_margin
+        chosen = chosen.where(chosen.scores > own.scores + margin, rival)
     chosen = chosen.where(best.scores > BAD, Pool(rescue, best.scores))
     actions = chosen.actions[:, 0].transpose(0, 1)
     return Plan(actions.reshape(*batch, *actions.shape[1:]), chosen.scores.reshape(batch))
@@ -237,6 +245,13 @@ def _first_candidates(
     policy_noise = policy_noise * problem.bounds.scale
     policy_noise = torch.cat([torch.zeros_like(center), policy_noise[:, 1:]], 1)
     return score_pool(state, actions, problem, settings, policy_noise, last, completed)
+
+
+def _rests(actions: Tensor, bounds: ActionBounds) -> Tensor:
+    """1 where sequences ``[H, N, B, m]`` change next to nothing from step to step, 0 elsewhere."""
+    changes = (actions[1:] - actions[:-1]).abs() / bounds.scale
+    mean = changes.sum((0, -1)) / (max(len(changes), 1) * actions.shape[-1])
+    return (mean <= _REST).to(actions)
 
 
 def _refit(elites: Pool, center: Tensor, std: Tensor, min_std: Tensor) -> tuple[Tensor, Tensor]:

@@ -103,9 +103,9 @@ def choose(
     - is not behind the actor where the first is, by over one standard error.
 
     Of those that are clearly smoother than what stays, with at most two thirds of its chatter, the
-    smoothest takes its place that does not earn less, by over one standard error, than what
-    smoothness may cost: 0.3 % of the return, or 1 % for one that rests in the end. The benefit of
-    doubt ends where the loss looks twice as large.
+    smoothest takes its place that does not earn less than what smoothness may cost: 0.3 % of the
+    return, or 1 % for one that rests in the end, which may earn less by a standard error more, but
+    no more than twice what it may cost.
     None does that falls behind the actor, by over one standard error, unless that is smoother too.
 
     The plan that is chosen acts if it earns more than the actor by over one standard error; else
@@ -201,10 +201,11 @@ def loses_nothing(cheap: Way, plan: Way) -> bool:
 
 def _costs_little(way: Way, best: Way) -> bool:
     """Whether a way earns as much as the best, but for what its smoothness may cost."""
-    share = _REST if way.mean_chatter <= RESTS < best.mean_chatter else _TRIFLE
+    rests = way.mean_chatter <= RESTS
+    share = _REST if rests and best.mean_chatter > RESTS else _TRIFLE
     allowed = share * abs(best.mean_return)
     ahead, error = way.ahead_of(best)
-    return ahead >= -allowed - min(error, allowed)
+    return ahead >= -allowed - (min(error, allowed) if rests else 0.0)
 
 
 def _behind(plan: Way, actor: Way, confidence: float) -> bool:

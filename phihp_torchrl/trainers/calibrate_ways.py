@@ -13,6 +13,8 @@ LEAVING = ("leaving", "priced")
 
 # Share of a step's reward below which a promise is rounding.
 _NOTHING = 1e-3
+# Margin in units of what most plans promise where the actor rests: near enough to none exceeds it.
+_ABOVE = 5.0
 # A search that goes on from the previous plan, and keeps it unless another is better.
 _STANDING = {"noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
 # What a plan has at most on the fast budget (config/settings/budget/fast.yaml).
@@ -30,8 +32,9 @@ _NEAR, _NEARER = 0.3, 0.1
 def leaving(config: SearchConfig, promise: float, reward: float) -> dict[str, dict[str, Any]]:
     """Two ways to plan that leave the actor alone where it rests, by name.
 
-    Their margin is twice what plans promise there. A plan that leaves the actor all the same may
-    find it worth its while to go on; the second way keeps it from that by a price of changes.
+    Their margin is five times what plans promise there, and counts only there. A plan that leaves
+    the actor all the same may find it worth its while to go on; the second way keeps it from that
+    by a price of changes.
 
     Args:
         config: the planner's settings.
@@ -45,13 +48,13 @@ def leaving(config: SearchConfig, promise: float, reward: float) -> dict[str, di
         >>> from phihp_torchrl.planners import CEMConfig
         >>> ways = leaving(CEMConfig(warm_start=True, noise_beta=2.0), 1.0, 0.5)
         >>> ways["leaving"]
-        {'actor_margin': 2.0}
+        {'actor_margin': 5.0, 'margin_at_rest': True}
         >>> ways["priced"]
-        {'change_cost': 0.5, 'keep_incumbent': True, 'actor_margin': 2.0}
+        {'change_cost': 0.5, 'keep_incumbent': True, 'actor_margin': 5.0, 'margin_at_rest': True}
         >>> leaving(CEMConfig(), 0.0, 1.0)
         {}
     """
-    margin = _fitting(config, {"actor_margin": _round(2 * promise)})
+    margin = _fitting(config, {"actor_margin": _round(_ABOVE * promise), "margin_at_rest": True})
     if promise < _NOTHING * reward or not margin:
         return {}
     priced = _fitting(config, {"change_cost": _round(reward), **_STANDING, **margin})

@@ -147,6 +147,18 @@ def test_a_margin_keeps_the_actor():
     assert torch.equal(kept, torch.zeros_like(kept))
 
 
+def test_a_margin_at_rest_keeps_only_an_actor_that_rests():
+    s = settings(num_policy_candidates=4, actor_margin=1e3, margin_at_rest=True)
+    resting = cem_plan(ZEROS, draw(s), problem=point_problem(torch.zeros_like), settings=s)
+    assert torch.equal(resting.actions, torch.zeros_like(resting.actions))
+    moving = point_problem(half_way)  # whose steps are half as long each time
+    free = cem_plan(ZEROS, draw(s), problem=moving, settings=replace(s, actor_margin=0.0))
+    found = cem_plan(ZEROS, draw(s), problem=moving, settings=s)
+    kept = cem_plan(ZEROS, draw(s), problem=moving, settings=replace(s, margin_at_rest=False))
+    assert torch.equal(found.actions, free.actions)
+    assert not torch.equal(found.actions, kept.actions)
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_splitting_a_batch_changes_nothing(variant):
     s = settings(**variant)

@@ -66,7 +66,7 @@ def test_each_way_fits_the_settings_and_changes_them():
     for changes in ways.values():
         assert replace(CEMConfig(), **changes) != CEMConfig()
     alone = leaving(CEMConfig(), 1.234, 0.5)
-    assert alone["leaving"] == {"actor_margin": 2.5}
+    assert alone["leaving"] == {"actor_margin": 6.2, "margin_at_rest": True}
     assert replace(CEMConfig(), **alone["priced"]).keep_incumbent
     known = replace(CEMConfig(), warm_start=True)
     assert "warm_start" not in calmer(known, 0.5)["calm"]

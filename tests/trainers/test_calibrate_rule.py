@@ -62,12 +62,17 @@ def test_smoothness_may_cost_a_trifle_of_the_return_whatever_the_actor_earns(act
         assert pick(given, way(*(1000.0 - loss,) * 4, chatter=0.1), actor=other).name == name
 
 
-def test_a_smooth_one_has_the_benefit_of_doubt_until_it_looks_twice_as_dear() -> None:
-    given = way(*(1000.0,) * 4)
+def test_one_that_rests_has_the_benefit_of_doubt_until_it_looks_twice_as_dear() -> None:
+    given = way(*(1000.0,) * 4, chatter=0.02)
     # It may cost 3. 5 with an error of 2.9, then of 0.6; 7 with one of 2.9.
     for losses, name in (((0, 0, 10, 10), "1"), ((4, 4, 6, 6), "0"), ((2, 2, 12, 12), "0")):
-        smooth = way(*(1000.0 - loss for loss in losses), chatter=0.1)
-        assert pick(given, smooth).name == name
+        resting = way(*(1000.0 - loss for loss in losses), chatter=0.0)
+        assert pick(given, resting).name == name
+
+
+def test_one_that_does_not_rest_has_no_benefit_of_doubt() -> None:
+    smooth = way(*(1000.0 - loss for loss in (0, 0, 10, 10)), chatter=0.1)
+    assert pick(way(*(1000.0,) * 4), smooth).name == "0"
 
 
 def test_at_a_return_of_nothing_smoothness_must_be_free() -> None:
