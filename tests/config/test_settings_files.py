@@ -95,8 +95,10 @@ def test_a_preset_holds_differences_alone(preset: str) -> None:
     assert changes["preset"] == preset
 
 
-def test_the_default_preset_is_the_dataclasses() -> None:
-    assert layer("preset/default.yaml") == {"preset": "default"}
+def test_the_default_preset_is_the_dataclasses_but_for_the_search() -> None:
+    changes = layer("preset/default.yaml")
+    assert changes.pop("preset") == "default"
+    assert {key.split(".")[0] for key in changes} == {"planner"}
 
 
 @pytest.mark.parametrize("path", sorted((YAML / "task").glob("*.yaml")), ids=lambda p: p.stem)
