@@ -15,7 +15,7 @@ from phihp_torchrl.deployment.c_actuator import actuator_source
 from phihp_torchrl.deployment.export_modules import ActorModule
 
 _ACTIVATIONS = {
-    nn.ReLU: "x > 0.0f ? x : 0.0f",
+    nn.ReLU: "x < 0.0f ? 0.0f : x",  # what is no number stays so, and is refused
     nn.Tanh: "tanhf(x)",
     nn.SiLU: "x / (1.0f + expf(-x))",
 }
@@ -25,8 +25,8 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
     """Write an actor as one C file without dependencies, from observation to action.
 
     The file has ``int NAME_act(const float *observation, float *action)``, where NAME is the name
-    of the file. It returns 0, or 1 for an observation that is not finite, and then writes the
-    action nearest to zero. Where the task has an actuator, there are besides a struct
+    of the file. It returns 0, or 1 where a number is not finite, and then writes the action nearest
+    to zero. Where the task has an actuator, there are besides a struct
     ``NAME_memory`` of what is under way, ``NAME_reset``, ``NAME_step``, which takes the observation
     of the system alone, and ``NAME_sent``, which is told a command that was sent in its place.
     ``cc -DNAME_MAIN`` makes a program that reads observations and writes actions, line by line.
@@ -114,8 +114,8 @@ _HEAD = """\
  *
  *   int {name}_act(const float *observation, float *action);
  *
- * It returns 0, or 1 for an observation that is not finite; the action is then the one nearest to
- * zero. Compile without -ffast-math:  cc -O3 -std=c99 -c {name}.c   (link with -lm)
+ * It returns 0, or 1 where a number is not finite; the action is then the one nearest to zero.
+ * Compile without -ffast-math:  cc -O3 -std=c99 -c {name}.c   (link with -lm)
  * As a program that reads observations and writes actions:  cc -O3 -D{NAME}_MAIN {name}.c -lm
  */
 #include <math.h>
@@ -137,19 +137,26 @@ static float clip(float x, int i)
     return x < low[i] ? low[i] : x > high[i] ? high[i] : x;
 }}
 
+static int nearest_to_zero(float *action)
+{{
+    int i;
+    for (i = 0; i < ACTION; i++) action[i] = clip(0.0f, i);
+    return 1;
+}}
+
 int {name}_act(const float *observation, float *action)
 {{
     float x[{size}], y[{size}];
     int i;
     for (i = 0; i < OBSERVATION; i++) {{
         x[i] = observation[i];
-        if (!isfinite(x[i])) {{
-            for (i = 0; i < ACTION; i++) action[i] = clip(0.0f, i);
-            return 1;
-        }}
+        if (!isfinite(x[i])) return nearest_to_zero(action);
     }}
 {layers}
-    for (i = 0; i < ACTION; i++) action[i] = center[i] + scale[i] * tanhf(x[i]);
+    for (i = 0; i < ACTION; i++) {{
+        action[i] = center[i] + scale[i] * tanhf(x[i]);
+        if (!isfinite(action[i])) return nearest_to_zero(action);
+    }}
     return 0;
 }}
 """

@@ -89,9 +89,15 @@ def test_what_is_under_way_is_kept(actuator, tmp_path):
 
 
 @needs_cc
-def test_an_observation_that_is_not_finite_gives_rest(tmp_path):
-    source = export_c(ActorModule(lively(get_task("pendulum"))), tmp_path / "actor.c")
-    assert run_c(source, torch.tensor([[1.0, float("nan"), 0.0]])).tolist() == [[0.0]]
+def test_what_is_not_finite_gives_rest(tmp_path):
+    agent = lively(get_task("pendulum"))
+    wrong = torch.tensor([[1.0, float("nan"), 0.0]])
+    assert run_c(export_c(ActorModule(agent), tmp_path / "actor.c"), wrong).tolist() == [[0.0]]
+    with torch.no_grad():  # hidden units overflow, and their sum is no number
+        agent.actor.module.mlp[0].weight.mul_(3e38)
+    far = torch.tensor([[0.0, 0.0, 3e38]])
+    assert agent(TensorDict(observation=far[0]))["action"].isnan()
+    assert run_c(export_c(ActorModule(agent), tmp_path / "far.c"), far).tolist() == [[0.0]]
 
 
 def test_what_has_no_c_is_named(tmp_path):
