@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from pathlib import Path
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.deployment.c_actuator import actuator_source
+from phihp_torchrl.deployment.c_header import header
+from phihp_torchrl.deployment.c_program import program_source
+from phihp_torchrl.deployment.c_registers import registers_source
+from phihp_torchrl.deployment.c_text import table
 from phihp_torchrl.deployment.export_modules import ActorModule
 
 _ACTIVATIONS = {
@@ -26,10 +27,18 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
 
     The file has ``int NAME_act(const float *observation, float *action)``, where NAME is the name
     of the file. It returns 0, or 1 where a number is not finite, and then writes the action nearest
-    to zero. Where the task has an actuator, there are besides a struct
-    ``NAME_memory`` of what is under way, ``NAME_reset``, ``NAME_step``, which takes the observation
-    of the system alone, and ``NAME_sent``, which is told a command that was sent in its place.
-    ``cc -DNAME_MAIN`` makes a program that reads observations and writes actions, line by line.
+    to zero. ``cc -DNAME_MAIN`` makes a program that reads observations and writes actions, line by
+    line. The comment at the head of the file says what there is, in which units and order.
+
+    Where the task has an actuator, the file also keeps what is under way, as an
+    :class:`~phihp_torchrl.Agent` does:
+
+    - ``NAME_memory``, a struct, and ``void NAME_reset(NAME_memory *memory)``, which is called where
+      an episode starts.
+    - ``int NAME_step(NAME_memory *memory, const float *observation, float *action)``, which is
+      called once a step, with the observation of the system alone.
+    - ``void NAME_sent(NAME_memory *memory, const float *command)``, which is told, after
+      ``NAME_step``, of a command that was sent in place of its action.
 
     Args:
         module: the actor, a network of linear layers with ReLU, tanh or SiLU.
@@ -40,17 +49,19 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
 
     Raises:
         ConfigError: for an actor of another make, and for a task that adds anything else to its
-            state than an actuator.
+            state than an actuator; the message names it.
 
     Examples:
         >>> import tempfile
+        >>> from dataclasses import replace
         >>> from phihp_torchrl import Agent, get_task
-        >>> task = get_task("pendulum")
+        >>> from phihp_torchrl.tasks import Actuator
+        >>> task = replace(get_task("pendulum"), actuator=Actuator(lag=0.1))
         >>> module = ActorModule(Agent(task, actor=Actor(task, (8,))))
         >>> with tempfile.TemporaryDirectory() as place:
-        ...     text = export_c(module, f"{place}/swing.c").read_text()
-        >>> "int swing_act(const float *observation, float *action)" in text
-        True
+        ...     lines = export_c(module, f"{place}/swing.c").read_text().splitlines()
+        >>> lines[3]
+        ' *     int swing_step(swing_memory *memory, const float *observation, float *action);'
     """
     path, task, actor = Path(path), module.task, module.network
     name = path.stem
@@ -58,16 +69,10 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
         raise ConfigError("path", f"expected a name of a C function before .c, got {name!r}.")
     if not isinstance(actor, Actor):
         raise ConfigError("agent", f"expected an Actor for C, got a {type(actor).__name__}.")
-    actuator = task.actuator
-    if task.register_count != (0 if actuator is None else actuator.registers(task.action_dim)):
-        raise ConfigError(
-            "agent",
-            "expected a task that adds to its state an actuator at most, for C; export the actor "
-            "as ONNX, and keep the rest of the state in a Controller.",
-        )
+    registers = registers_source(name, task) if task.register_count else None
     bounds = task.bounds
     tables = {"low": bounds.low, "high": bounds.high, "center": bounds.center}
-    parts = [_HEAD.format(name=name, task=task.name, NAME=name.upper())]
+    parts = [header(name, task), "#include <math.h>\n#include <stddef.h>\n"]
     parts += [f"enum {{ OBSERVATION = {task.observation_dim}, ACTION = {task.action_dim} }};\n"]
     parts += [table(key, values) for key, values in (tables | {"scale": bounds.scale}).items()]
     calls = []
@@ -91,35 +96,11 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
                 f"got a {type(layer).__name__}.",
             )
     parts.append(_ACT.format(name=name, size=size, layers="\n".join(calls)))
-    if task.register_count:
-        parts.append(actuator_source(name, task))
-    main = _MAIN_STEP if task.register_count else _MAIN_ACT
-    size = task.system.observation_dim
-    parts.append(main.format(name=name, NAME=name.upper(), size=size))
+    parts += [] if registers is None else [registers]
+    parts.append(program_source(name, task))
     path.write_text("\n".join(parts), encoding="utf-8")
     return path
 
-
-def table(name: str, values: Tensor | Iterable[float]) -> str:
-    """A constant array of floats, each as it is to the bit."""
-    flat = torch.as_tensor(values, dtype=torch.float32).detach().cpu().flatten().tolist()
-    words = [f"{each:.9g}" for each in flat]
-    words = [word if any(c in word for c in ".e") else f"{word}.0" for word in words]
-    lines = [", ".join(f"{w}f" for w in words[i : i + 8]) for i in range(0, len(words), 8)]
-    return f"static const float {name}[] = {{\n    " + ",\n    ".join(lines) + "\n};\n"
-
-
-_HEAD = """\
-/* The actor of an agent for the task {task}: observation in, action out, in physical units.
- *
- *   int {name}_act(const float *observation, float *action);
- *
- * It returns 0, or 1 where a number is not finite; the action is then the one nearest to zero.
- * Compile without -ffast-math:  cc -O3 -std=c99 -c {name}.c   (link with -lm)
- * As a program that reads observations and writes actions:  cc -O3 -D{NAME}_MAIN {name}.c -lm
- */
-#include <math.h>
-"""
 
 _ACT = """\
 /* y = W x + b; the rows of W are stored as columns, so that a compiler can use vectors. */
@@ -160,27 +141,3 @@ int {name}_act(const float *observation, float *action)
     return 0;
 }}
 """
-
-_MAIN_ACT = """\
-#ifdef {NAME}_MAIN
-#include <stdio.h>
-int main(void)
-{{
-    float observation[{size}], action[ACTION];
-    int i = 0;
-    while (scanf("%f", &observation[i]) == 1) {{
-        if (++i < {size}) continue;
-        {name}_act(observation, action);
-        for (i = 0; i < ACTION; i++) printf("%.9g%c", action[i], i < ACTION - 1 ? ' ' : '\\n');
-        fflush(stdout);
-        i = 0;
-    }}
-    return 0;
-}}
-#endif
-"""
-
-_START = "int i = 0;\n    {name}_memory memory;\n    {name}_reset(&memory);\n"
-_MAIN_STEP = _MAIN_ACT.replace("int i = 0;\n", _START, 1).replace(
-    "{name}_act(observation", "{name}_step(&memory, observation"
-)
