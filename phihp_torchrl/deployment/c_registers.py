@@ -9,9 +9,11 @@ import torch
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment.c_actuator import actuator_in_c
+from phihp_torchrl.deployment.c_last_action import last_action_in_c
 from phihp_torchrl.deployment.c_part import CPart
+from phihp_torchrl.deployment.c_signal import signal_in_c
 from phihp_torchrl.deployment.c_text import table
-from phihp_torchrl.tasks import ActuatorPart, Task
+from phihp_torchrl.tasks import ActuatorPart, LastAction, SignalPart, Task
 
 
 def parts_in_c(task: Task) -> list[CPart]:
@@ -21,25 +23,33 @@ def parts_in_c(task: Task) -> list[CPart]:
         task: the task.
 
     Raises:
-        ConfigError: for a part that is no actuator; the message names it.
+        ConfigError: for a part that has no C, such as an estimated disturbance; the message names
+            it.
 
     Examples:
         >>> from dataclasses import replace
         >>> from phihp_torchrl import get_task
-        >>> from phihp_torchrl.tasks import Actuator
-        >>> len(parts_in_c(replace(get_task("pendulum"), actuator=Actuator(lag=0.1))))
-        1
+        >>> [part.limit for part in parts_in_c(replace(get_task("pendulum"), action_rate_cost=0.1))]
+        ['']
     """
-    found, place = list[CPart](), 0
+    found, place, signals = list[CPart](), 0, 0
     for part in task.registers.parts:
-        if type(part) is not ActuatorPart:
+        if type(part) is SignalPart:
+            found.append(signal_in_c(part.signal, part.name, place, signals))
+            signals += 1
+        elif type(part) is ActuatorPart:
+            if part.size:
+                moved = actuator_in_c(part.actuator, task.action_dim, task.time_step, place)
+                found.append(moved)
+        elif type(part) is LastAction:
+            found.append(last_action_in_c(task, place))
+        else:
             raise ConfigError(
                 "agent",
-                "expected a task that adds no more to its state than an actuator, for C, got "
-                f"{part.name!r}; export the actor as ONNX, and keep the state in a Controller.",
+                "expected a task that adds no more to its state than a reference, inputs, an "
+                f"actuator and the last action, for C, got {part.name!r} (an estimated disturbance "
+                "needs the model); export the actor as ONNX, and keep the state in a Controller.",
             )
-        if part.size:
-            found.append(actuator_in_c(part.actuator, task.action_dim, task.time_step, place))
         place += part.size
     return found
 
@@ -75,8 +85,7 @@ def registers_source(name: str, task: Task) -> str:
     Examples:
         >>> from dataclasses import replace
         >>> from phihp_torchrl import get_task
-        >>> from phihp_torchrl.tasks import Actuator
-        >>> task = replace(get_task("pendulum"), actuator=Actuator(lag=0.1))
+        >>> task = replace(get_task("pendulum"), action_rate_limit=5.0)
         >>> "void swing_reset(swing_memory *memory)" in registers_source("swing", task)
         True
     """

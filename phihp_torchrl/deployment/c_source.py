@@ -30,13 +30,19 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
     to zero. ``cc -DNAME_MAIN`` makes a program that reads observations and writes actions, line by
     line. The comment at the head of the file says what there is, in which units and order.
 
-    Where the task has an actuator, the file also keeps what is under way, as an
-    :class:`~phihp_torchrl.Agent` does:
+    Where the task has an actuator, a limit or a price of the action's rate, a reference or inputs,
+    the file also keeps what they add to the state, as an :class:`~phihp_torchrl.Agent` does:
 
     - ``NAME_memory``, a struct, and ``void NAME_reset(NAME_memory *memory)``, which is called where
       an episode starts.
-    - ``int NAME_step(NAME_memory *memory, const float *observation, float *action)``, which is
-      called once a step, with the observation of the system alone.
+    - ``int NAME_step(NAME_memory *memory, const float *observation, const float *inputs, const
+      float *reference, float *action)``, which is called once a step. The observation is that of
+      the system alone, and a signal that the task does not have is no parameter. A signal is its
+      window ``[rows, k]``, row by row in physical units, the present value first. It must be given
+      where an episode starts; later ``NULL`` keeps the last window, moved up by a step. The action
+      is in its bounds and within the rate limit. The function returns 1 for numbers that are not
+      finite and for a signal that has never been given; it then writes the action nearest to zero
+      that the rate limit allows, and keeps the last window.
     - ``void NAME_sent(NAME_memory *memory, const float *command)``, which is told, after
       ``NAME_step``, of a command that was sent in place of its action.
 
@@ -48,15 +54,14 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
         The path.
 
     Raises:
-        ConfigError: for an actor of another make, and for a task that adds anything else to its
-            state than an actuator; the message names it.
+        ConfigError: for an actor of another make, and for a task with an estimated disturbance,
+            whose estimate needs the model; the message names it.
 
     Examples:
         >>> import tempfile
         >>> from dataclasses import replace
         >>> from phihp_torchrl import Agent, get_task
-        >>> from phihp_torchrl.tasks import Actuator
-        >>> task = replace(get_task("pendulum"), actuator=Actuator(lag=0.1))
+        >>> task = replace(get_task("pendulum"), action_rate_limit=5.0)
         >>> module = ActorModule(Agent(task, actor=Actor(task, (8,))))
         >>> with tempfile.TemporaryDirectory() as place:
         ...     lines = export_c(module, f"{place}/swing.c").read_text().splitlines()
