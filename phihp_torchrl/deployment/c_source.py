@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from pathlib import Path
 
-import torch
-from torch import Tensor, nn
+from torch import nn
 
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.deployment.c_actuator import actuator_source
+from phihp_torchrl.deployment.c_header import header
+from phihp_torchrl.deployment.c_program import program_source
+from phihp_torchrl.deployment.c_registers import registers_source
+from phihp_torchrl.deployment.c_text import table
 from phihp_torchrl.deployment.export_modules import ActorModule
 
 _ACTIVATIONS = {
-    nn.ReLU: "x > 0.0f ? x : 0.0f",
+    nn.ReLU: "x < 0.0f ? 0.0f : x",  # what is no number stays so, and is refused
     nn.Tanh: "tanhf(x)",
     nn.SiLU: "x / (1.0f + expf(-x))",
 }
@@ -25,11 +26,25 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
     """Write an actor as one C file without dependencies, from observation to action.
 
     The file has ``int NAME_act(const float *observation, float *action)``, where NAME is the name
-    of the file. It returns 0, or 1 for an observation that is not finite, and then writes the
-    action nearest to zero. Where the task has an actuator, there are besides a struct
-    ``NAME_memory`` of what is under way, ``NAME_reset``, ``NAME_step``, which takes the observation
-    of the system alone, and ``NAME_sent``, which is told a command that was sent in its place.
-    ``cc -DNAME_MAIN`` makes a program that reads observations and writes actions, line by line.
+    of the file. It returns 0, or 1 where a number is not finite, and then writes the action nearest
+    to zero. ``cc -DNAME_MAIN`` makes a program that reads observations and writes actions, line by
+    line. The comment at the head of the file says what there is, in which units and order.
+
+    Where the task has an actuator, a limit or a price of the action's rate, a reference or inputs,
+    the file also keeps what they add to the state, as an :class:`~phihp_torchrl.Agent` does:
+
+    - ``NAME_memory``, a struct, and ``void NAME_reset(NAME_memory *memory)``, which is called where
+      an episode starts.
+    - ``int NAME_step(NAME_memory *memory, const float *observation, const float *inputs, const
+      float *reference, float *action)``, which is called once a step. The observation is that of
+      the system alone, and a signal that the task does not have is no parameter. A signal is its
+      window ``[rows, k]``, row by row in physical units, the present value first. It must be given
+      where an episode starts; later ``NULL`` keeps the last window, moved up by a step. The action
+      is in its bounds and within the rate limit. The function returns 1 for numbers that are not
+      finite and for a signal that has never been given; it then writes the action nearest to zero
+      that the rate limit allows, and keeps the last window.
+    - ``void NAME_sent(NAME_memory *memory, const float *command)``, which is told, after
+      ``NAME_step``, of a command that was sent in place of its action.
 
     Args:
         module: the actor, a network of linear layers with ReLU, tanh or SiLU.
@@ -39,18 +54,19 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
         The path.
 
     Raises:
-        ConfigError: for an actor of another make, and for a task that adds anything else to its
-            state than an actuator.
+        ConfigError: for an actor of another make, and for a task with an estimated disturbance,
+            whose estimate needs the model; the message names it.
 
     Examples:
         >>> import tempfile
+        >>> from dataclasses import replace
         >>> from phihp_torchrl import Agent, get_task
-        >>> task = get_task("pendulum")
+        >>> task = replace(get_task("pendulum"), action_rate_limit=5.0)
         >>> module = ActorModule(Agent(task, actor=Actor(task, (8,))))
         >>> with tempfile.TemporaryDirectory() as place:
-        ...     text = export_c(module, f"{place}/swing.c").read_text()
-        >>> "int swing_act(const float *observation, float *action)" in text
-        True
+        ...     lines = export_c(module, f"{place}/swing.c").read_text().splitlines()
+        >>> lines[3]
+        ' *     int swing_step(swing_memory *memory, const float *observation, float *action);'
     """
     path, task, actor = Path(path), module.task, module.network
     name = path.stem
@@ -58,16 +74,10 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
         raise ConfigError("path", f"expected a name of a C function before .c, got {name!r}.")
     if not isinstance(actor, Actor):
         raise ConfigError("agent", f"expected an Actor for C, got a {type(actor).__name__}.")
-    actuator = task.actuator
-    if task.register_count != (0 if actuator is None else actuator.registers(task.action_dim)):
-        raise ConfigError(
-            "agent",
-            "expected a task that adds to its state an actuator at most, for C; export the actor "
-            "as ONNX, and keep the rest of the state in a Controller.",
-        )
+    registers = registers_source(name, task) if task.register_count else None
     bounds = task.bounds
     tables = {"low": bounds.low, "high": bounds.high, "center": bounds.center}
-    parts = [_HEAD.format(name=name, task=task.name, NAME=name.upper())]
+    parts = [header(name, task), "#include <math.h>\n#include <stddef.h>\n"]
     parts += [f"enum {{ OBSERVATION = {task.observation_dim}, ACTION = {task.action_dim} }};\n"]
     parts += [table(key, values) for key, values in (tables | {"scale": bounds.scale}).items()]
     calls = []
@@ -91,35 +101,11 @@ def export_c(module: ActorModule, path: str | Path) -> Path:
                 f"got a {type(layer).__name__}.",
             )
     parts.append(_ACT.format(name=name, size=size, layers="\n".join(calls)))
-    if task.register_count:
-        parts.append(actuator_source(name, task))
-    main = _MAIN_STEP if task.register_count else _MAIN_ACT
-    size = task.system.observation_dim
-    parts.append(main.format(name=name, NAME=name.upper(), size=size))
+    parts += [] if registers is None else [registers]
+    parts.append(program_source(name, task))
     path.write_text("\n".join(parts), encoding="utf-8")
     return path
 
-
-def table(name: str, values: Tensor | Iterable[float]) -> str:
-    """A constant array of floats, each as it is to the bit."""
-    flat = torch.as_tensor(values, dtype=torch.float32).detach().cpu().flatten().tolist()
-    words = [f"{each:.9g}" for each in flat]
-    words = [word if any(c in word for c in ".e") else f"{word}.0" for word in words]
-    lines = [", ".join(f"{w}f" for w in words[i : i + 8]) for i in range(0, len(words), 8)]
-    return f"static const float {name}[] = {{\n    " + ",\n    ".join(lines) + "\n};\n"
-
-
-_HEAD = """\
-/* The actor of an agent for the task {task}: observation in, action out, in physical units.
- *
- *   int {name}_act(const float *observation, float *action);
- *
- * It returns 0, or 1 for an observation that is not finite; the action is then the one nearest to
- * zero. Compile without -ffast-math:  cc -O3 -std=c99 -c {name}.c   (link with -lm)
- * As a program that reads observations and writes actions:  cc -O3 -D{NAME}_MAIN {name}.c -lm
- */
-#include <math.h>
-"""
 
 _ACT = """\
 /* y = W x + b; the rows of W are stored as columns, so that a compiler can use vectors. */
@@ -137,43 +123,26 @@ static float clip(float x, int i)
     return x < low[i] ? low[i] : x > high[i] ? high[i] : x;
 }}
 
+static int nearest_to_zero(float *action)
+{{
+    int i;
+    for (i = 0; i < ACTION; i++) action[i] = clip(0.0f, i);
+    return 1;
+}}
+
 int {name}_act(const float *observation, float *action)
 {{
     float x[{size}], y[{size}];
     int i;
     for (i = 0; i < OBSERVATION; i++) {{
         x[i] = observation[i];
-        if (!isfinite(x[i])) {{
-            for (i = 0; i < ACTION; i++) action[i] = clip(0.0f, i);
-            return 1;
-        }}
+        if (!isfinite(x[i])) return nearest_to_zero(action);
     }}
 {layers}
-    for (i = 0; i < ACTION; i++) action[i] = center[i] + scale[i] * tanhf(x[i]);
-    return 0;
-}}
-"""
-
-_MAIN_ACT = """\
-#ifdef {NAME}_MAIN
-#include <stdio.h>
-int main(void)
-{{
-    float observation[{size}], action[ACTION];
-    int i = 0;
-    while (scanf("%f", &observation[i]) == 1) {{
-        if (++i < {size}) continue;
-        {name}_act(observation, action);
-        for (i = 0; i < ACTION; i++) printf("%.9g%c", action[i], i < ACTION - 1 ? ' ' : '\\n');
-        fflush(stdout);
-        i = 0;
+    for (i = 0; i < ACTION; i++) {{
+        action[i] = center[i] + scale[i] * tanhf(x[i]);
+        if (!isfinite(action[i])) return nearest_to_zero(action);
     }}
     return 0;
 }}
-#endif
 """
-
-_START = "int i = 0;\n    {name}_memory memory;\n    {name}_reset(&memory);\n"
-_MAIN_STEP = _MAIN_ACT.replace("int i = 0;\n", _START, 1).replace(
-    "{name}_act(observation", "{name}_step(&memory, observation"
-)

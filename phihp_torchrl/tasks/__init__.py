@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from phihp_torchrl.tasks import acrobot, cartpole, pendulum  # (they register themselves)
 from phihp_torchrl.tasks.actuator import Actuator
+from phihp_torchrl.tasks.actuator_part import ActuatorPart
 from phihp_torchrl.tasks.base import Task
 from phihp_torchrl.tasks.bounds import ActionBounds
 from phihp_torchrl.tasks.box import Box
@@ -11,10 +12,11 @@ from phihp_torchrl.tasks.constraint import Constraint
 from phihp_torchrl.tasks.disturbance import Disturbance, DisturbancePart
 from phihp_torchrl.tasks.dry_run import check_functions
 from phihp_torchrl.tasks.last_action import LastAction
-from phihp_torchrl.tasks.numbers import Numbers
+from phihp_torchrl.tasks.numbers import Numbers, one_each
 from phihp_torchrl.tasks.registers import Part, Registers
 from phihp_torchrl.tasks.registry import find_task, get_task, list_tasks, register_task
 from phihp_torchrl.tasks.signal import Signal
+from phihp_torchrl.tasks.signal_parts import SignalPart
 from phihp_torchrl.tasks.steps import RewardFn, Step, TerminatedFn, Transition
 from phihp_torchrl.tasks.trajectories import Trajectories
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from dataclasses import replace
 
 import pytest
@@ -15,45 +13,11 @@ from phihp_torchrl import Agent, get_task
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.deployment import ActorModule, export_c
 from phihp_torchrl.tasks import Actuator
-
-CC = shutil.which("cc")
-needs_cc = pytest.mark.skipif(CC is None, reason="there is no C compiler, cc")
+from tests.deployment.compiled_c import ask, lively, needs_cc, words
 
 
 def run_c(source, observations):
-    """Compile a source as its program, with every warning an error, and ask it for actions."""
-    program = source.with_suffix("")
-    flag = f"-D{source.stem.upper()}_MAIN"
-    words = [
-        CC,
-        "-O2",
-        "-std=c99",
-        "-Wall",
-        "-Wextra",
-        "-Werror",
-        flag,
-        source,
-        "-o",
-        program,
-        "-lm",
-    ]
-    subprocess.run([*map(str, words)], check=True, timeout=120)
-    text = "\n".join(" ".join(f"{x:.9g}" for x in row) for row in observations.tolist())
-    done = subprocess.run(
-        [str(program)], input=text + "\n", capture_output=True, text=True, timeout=60, check=True
-    )
-    return torch.tensor(
-        [[float(word) for word in line.split()] for line in done.stdout.splitlines()]
-    )
-
-
-def lively(task, widths=(16, 12)):
-    """An agent whose actions differ and reach the bounds."""
-    torch.manual_seed(0)
-    actor = Actor(task, widths)
-    with torch.no_grad():
-        actor.mlp[-1].weight.mul_(8.0)
-    return Agent(task, actor=actor)
+    return ask(source, map(words, observations))
 
 
 @needs_cc
@@ -89,9 +53,15 @@ def test_what_is_under_way_is_kept(actuator, tmp_path):
 
 
 @needs_cc
-def test_an_observation_that_is_not_finite_gives_rest(tmp_path):
-    source = export_c(ActorModule(lively(get_task("pendulum"))), tmp_path / "actor.c")
-    assert run_c(source, torch.tensor([[1.0, float("nan"), 0.0]])).tolist() == [[0.0]]
+def test_what_is_not_finite_gives_rest(tmp_path):
+    agent = lively(get_task("pendulum"))
+    wrong = torch.tensor([[1.0, float("nan"), 0.0]])
+    assert run_c(export_c(ActorModule(agent), tmp_path / "actor.c"), wrong).tolist() == [[0.0]]
+    with torch.no_grad():  # hidden units overflow, and their sum is no number
+        agent.actor.module.mlp[0].weight.mul_(3e38)
+    far = torch.tensor([[0.0, 0.0, 3e38]])
+    assert agent(TensorDict(observation=far[0]))["action"].isnan()
+    assert run_c(export_c(ActorModule(agent), tmp_path / "far.c"), far).tolist() == [[0.0]]
 
 
 def test_what_has_no_c_is_named(tmp_path):
