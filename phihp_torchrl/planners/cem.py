@@ -216,7 +216,9 @@ def cem_plan(
     if compare:
         # The actor's sequence, unless the plan is better; the best candidate if its score is bad.
         rival = own.where(own.scores > BAD, best)
-        margin = s.actor_margin * _rests(own.actions, bounds) if s.margin_at_rest else s.actor_margin
+        margin: Any = s.actor_margin
+        if s.margin_at_rest:
+            margin = margin * _rests(own.actions, bounds)
         chosen = chosen.where(chosen.scores > own.scores + margin, rival)
     chosen = chosen.where(best.scores > BAD, Pool(rescue, best.scores))
     actions = chosen.actions[:, 0].transpose(0, 1)
