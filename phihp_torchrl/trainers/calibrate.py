@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.planners import SearchConfig, score_sequences
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
-from phihp_torchrl.trainers.calibrate_contest import Contest
+from phihp_torchrl.trainers.calibrate_contest import KNOWN, Contest
 from phihp_torchrl.trainers.calibrate_report import report, summary, warn_of_doubt, write_table
 from phihp_torchrl.trainers.calibrate_rule import RESTS, Choice, choose, in_doubt, loses_nothing
 from phihp_torchrl.trainers.calibrate_ways import LEAVING, calmer, faster, leaving
@@ -26,9 +26,6 @@ from phihp_torchrl.trainers.phases import Phase, register_phase
 _LITTLE = 3.0
 # The way to plan that is as the chosen one, on the fast budget.
 _FAST = "fast"
-# Episodes from which on a difference of so many standard errors is taken as certain: a plan that
-# gains in most episodes, and fails in one of ten, shows it in that many.
-_KNOWN = 24
 # States of the actor's second halves, for each episode, at which plans say what they promise.
 _PROMISES = 8
 _PROMISE_SHARE = 0.95
@@ -241,9 +238,9 @@ class CalibratePhase:
         actor, confidence = contest.actor(contest.episodes), self.config.confidence
         left = {name: contest.way(name)}
         choice = choose(left, actor, confidence=confidence, doubted=self.doubted)
-        enough = contest.episodes >= min(_KNOWN, self.config.max_episodes)
+        enough = contest.episodes >= min(KNOWN, self.config.max_episodes)
         known = choice.is_tie or (choice.certain and enough)
-        if known or not contest.double():
+        if known or not contest.go_on():
             self._finish(choice._replace(certain=known))
         return choice
 

@@ -18,8 +18,8 @@ class CalibrateConfig:
             more.
         confidence: standard errors by which one way to plan must beat another, and by which one of
             plan and actor beats the other without doubt.
-        max_episodes: episodes at most; their number doubles up to 24, and while it is in doubt
-            who is to act.
+        max_episodes: episodes at most; the way that is chosen goes on to 24, and to twice as many
+            while it is in doubt who is to act.
         budget: transitions that plans may imagine, nearly half of them before a way is chosen; a
             call of the model counts as a thousand more, and one of a network as one for each ten
             thousand weights, so a million takes about half a second of one core. Transitions of a
@@ -41,7 +41,7 @@ class CalibrateConfig:
     episodes: int = 6
     confidence: float = 2.0
     max_episodes: int = 48
-    budget: int = 80_000_000
+    budget: int = 160_000_000
 
     def __post_init__(self) -> None:
         check_fields(self)

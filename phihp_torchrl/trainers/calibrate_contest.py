@@ -18,6 +18,10 @@ from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_rule import Way
 from phihp_torchrl.trainers.imagined_play import Played, play
 
+KNOWN = 24
+"""Episodes from which on a difference of so many standard errors is taken as certain: a plan that
+gains in most episodes, and fails in one of ten, shows it in that many."""
+
 # Ways to plan that play whatever they cost; further ones do as far as the budget goes.
 _IN_ANY_CASE = 2
 # Episodes that a way plays whatever they cost once it is the only one left.
@@ -93,20 +97,19 @@ class Contest:
         new = (found.total.tolist(), found.chatter().tolist())
         self._played[name] = [[*old, *more] for old, more in zip(before, new, strict=True)]
 
-    def double(self) -> bool:
-        """Go on to as many episodes again, if their limit and the budget allow it.
+    def go_on(self) -> bool:
+        """Go on to :data:`KNOWN` episodes, or to twice as many, as far as limit and budget allow.
 
         Returns:
-            Whether they do.
+            Whether there are more.
         """
-        more = min(self.episodes, self.config.max_episodes - self.episodes)
-        cost = len(self.playing) * self._cost(more, self._length)
-        if self.spent + cost > self.config.budget:
-            more = min(more, _ALONE - self.episodes)
-        if more < 1:
-            return False
-        self.episodes += more
-        return True
+        more = max(self.episodes, KNOWN - self.episodes)
+        most = min(more, self.config.max_episodes - self.episodes)
+        left = (self.config.budget - self.spent) / len(self.playing)
+        paid = (n for n in range(most, 0, -1) if self._cost(n, self._length) <= left)
+        more = max(next(paid, 0), min(_ALONE - self.episodes, most))
+        self.episodes += max(more, 0)
+        return more > 0
 
     def add(self, name: str, changes: Mapping[str, Any]) -> None:
         """Let one more way to plan play as many episodes as the last ones have."""

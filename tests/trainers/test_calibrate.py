@@ -186,10 +186,10 @@ def test_a_chosen_way_plays_six_episodes_whatever_they_cost(first):
     contest.begin({"given": {}})
     contest.episodes = first
     contest.play("given")
-    assert contest.double()
+    assert contest.go_on()
     contest.play("given")
     assert len(contest.way("given").returns) == 6
-    assert not contest.double()
+    assert not contest.go_on()
 
 
 def test_dear_plans_begin_with_fewer_episodes():
