@@ -67,6 +67,12 @@ def physical_step(dynamics: nn.Module) -> Step:
     return getattr(dynamics, "step", dynamics)
 
 
+def is_smooth(task: Task) -> bool:
+    """Whether a small command has an effect in proportion, in a task's actuator."""
+    numbers = {} if task.actuator is None else task.actuator.config
+    return not {"dead_zone", "slew"} & set(numbers)
+
+
 def half_ranges(task: Task) -> tuple[Tensor, Tensor]:
     """Half-ranges of state and action, float64 ``[n]`` and ``[m]``: the units of "large".
 
