@@ -90,12 +90,9 @@ class LQR(Controller):
         return cls(point, *found, weights.unit)
 
     def act(self, state: Tensor, starts: Tensor | None = None) -> Tensor:
-        return self.point.action.to(state) - self._error(state) @ self.gain.to(state).mT
+        return self.point.action.to(state) - self.point.difference(state) @ self.gain.to(state).mT
 
     def value(self, state: Tensor) -> Tensor:
         """The cost-to-go of the unbounded regulator, ``[*batch]``, in units of its weights."""
-        error = self._error(state)
+        error = self.point.difference(state)
         return ((error @ self.cost.to(state)) * error).sum(-1)
-
-    def _error(self, state: Tensor) -> Tensor:
-        return self.point.difference(state[..., : len(self.point.state)])

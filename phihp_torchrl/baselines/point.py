@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.func import jacfwd
 
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.tasks import Step, Task
+from phihp_torchrl.tasks import DisturbancePart, SignalPart, Step, Task
 
 Matrix = NDArray[np.float64]
 
@@ -30,14 +30,15 @@ class LinearModel:
     """A task's one step around a state at rest: ``z[k+1] = A z[k] + B u[k]``.
 
     ``z`` is the difference to the point's state, of angles on the circle, and ``u`` that to its
-    action. ``z`` has the registers of the task too, unless they were left out.
+    action. ``z`` has the registers of the task that an action moves too, unless they were left out.
 
     Args:
         task: the task.
-        state: the state at rest, float64 ``[n]``.
+        state: the state at rest, float64 ``[n]``, of the components of ``z``.
         action: the action that keeps it there, float64 ``[m]``.
         a: the matrix A, ``[n, n]``.
         b: the matrix B, ``[n, m]``.
+        moved: the registers in ``z``, by their places among those of the task.
     """
 
     task: Task
@@ -45,15 +46,29 @@ class LinearModel:
     action: Tensor
     a: Matrix
     b: Matrix
+    moved: tuple[int, ...] = ()
 
-    def difference(self, state: Tensor) -> Tensor:
-        """``state - self.state``, in the dtype and on the device of ``state`` ``[*batch, n]``."""
-        physical, registers = self.task.split(state)
-        at, under_way = self.task.split(self.state.to(state))
-        delta = self.task.system.difference(physical, at)
-        if not under_way.shape[-1]:
+    def difference(self, state: Tensor, at: Tensor | None = None) -> Tensor:
+        """``z`` of a state, in its dtype and on its device.
+
+        Args:
+            state: states of the task, ``[*batch, N]``.
+            at: states of the task in place of the point's, ``[*batch, N]``.
+        """
+        own = self._own(state)
+        at = self.state.to(state) if at is None else self._own(at)
+        size = self.task.system.state_dim
+        delta = self.task.system.difference(own[..., :size], at[..., :size])
+        if not self.moved:
             return delta
-        return torch.cat([delta, registers - under_way], -1)
+        return torch.cat([delta, own[..., size:] - at[..., size:]], -1)
+
+    def _own(self, state: Tensor) -> Tensor:
+        """The components of a state of the task that ``z`` has."""
+        physical, registers = self.task.split(state)
+        if not self.moved:
+            return physical
+        return torch.cat([physical, registers[..., list(self.moved)]], -1)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -99,9 +114,9 @@ def linearise(
         dynamics: the model, ``(state, action) -> next state``.
         goal: the physical state at which to linearise. Defaults to the task's goal: the centre of
             its box ``goal``, or else a state at rest whose reward no state of the wide box exceeds.
-        registers: whether the task's registers, such as commands under way and the last action,
-            belong to the state, those of a reference apart. With an estimated disturbance they are
-            left out.
+        registers: whether the registers that an action moves, such as commands under way and the
+            last action, belong to the state. Those of a reference and of an estimated disturbance
+            never do.
         follows: components that follow the task's reference, and have the values of ``goal``; the
             others are those at which the model rests there, sought from ``goal``.
 
@@ -115,9 +130,8 @@ def linearise(
     dynamics = copy.deepcopy(dynamics).to(device="cpu", dtype=torch.float64)
     step = physical_step(dynamics)
     state, action = _rest(task, step, goal, follows)
-    at, move = state, step
-    # An estimated disturbance is no action's to move.
-    if registers and task.register_count and task.disturbance is None:
+    at, move, moved = state, step, _moved(task) if registers else ()
+    if moved:
         at = torch.cat([state, task.registers.rest(action)])
         move = _with_registers(task, step)
     with torch.no_grad():
@@ -125,12 +139,19 @@ def linearise(
         a = _with_secants(task, move, at, action, slope_a)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise ConfigError("dynamics", "expected finite derivatives at the goal, got others.")
-    if len(at) > len(state) and task.outside is not None:  # these are the first of the registers
-        outside = slice(len(state), len(state) + task.outside.size)
-        at = torch.cat([at[: outside.start], at[outside.stop :]])
-        a, b = np.delete(a, outside, 0), np.delete(b, outside, 0)
-        a = np.delete(a, outside, 1)
-    return LinearModel(task, at, action, a, b)
+    size = len(state)
+    kept = [*range(size), *(size + place for place in moved)]
+    return LinearModel(task, at[kept], action, a[np.ix_(kept, kept)], b[kept], moved)
+
+
+def _moved(task: Task) -> tuple[int, ...]:
+    """The places of the registers that actions move: all but signals and disturbances."""
+    places, first = list[int](), 0
+    for part, size in zip(task.registers.parts, task.registers.sizes, strict=True):
+        if not isinstance(part, (SignalPart, DisturbancePart)):
+            places += range(first, first + size)
+        first += size
+    return tuple(places)
 
 
 def _with_secants(task: Task, move: Step, at: Tensor, action: Tensor, a: Matrix) -> Matrix:

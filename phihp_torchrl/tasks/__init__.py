@@ -15,6 +15,7 @@ from phihp_torchrl.tasks.numbers import Numbers
 from phihp_torchrl.tasks.registers import Part, Registers
 from phihp_torchrl.tasks.registry import find_task, get_task, list_tasks, register_task
 from phihp_torchrl.tasks.signal import Signal
+from phihp_torchrl.tasks.signal_parts import SignalPart
 from phihp_torchrl.tasks.steps import RewardFn, Step, TerminatedFn, Transition
 from phihp_torchrl.tasks.trajectories import Trajectories
 
