@@ -77,9 +77,10 @@ class LQR(Controller):
             action_weights: diagonal of R, in place of the reward's.
 
         Raises:
-            ConfigError: where the task has no goal in which the model rests, for weights of the
-                wrong number or sign, and where the action cannot stabilise the goal; the message
-                names the component that it does not reach.
+            ConfigError: where the task has no goal in which the model rests, or has a reference,
+                which an :class:`LQI` follows, for weights of the wrong number or sign, and where
+                the action cannot stabilise the goal; the message names the component that it does
+                not reach.
         """
         point = linearise(task, dynamics, goal, registers=is_smooth(task))
         weights = find_weights(task, point, state_weights, action_weights)

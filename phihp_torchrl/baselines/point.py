@@ -19,8 +19,10 @@ Matrix = NDArray[np.float64]
 
 _SECANT = 0.05
 """Half-ranges to either side of the goal across which slopes of the state are taken."""
-_DRIFT = 0.01
+DRIFT = 0.01
 """The largest motion in one step, in half-ranges of the state, of what counts as a rest."""
+_STILL = 1e-12
+"""The motion below which a rest is not sought any better."""
 _SAMPLES = 512
 """States of the wide box whose rewards are compared with that of a goal."""
 
@@ -82,6 +84,11 @@ def physical_step(dynamics: nn.Module) -> Step:
     return getattr(dynamics, "step", dynamics)
 
 
+def exact_step(dynamics: nn.Module) -> Step:
+    """The same of a copy of the model, in double precision on the CPU."""
+    return physical_step(copy.deepcopy(dynamics).to(device="cpu", dtype=torch.float64))
+
+
 def is_smooth(task: Task) -> bool:
     """Whether a small command has an effect in proportion, in a task's actuator."""
     numbers = {} if task.actuator is None else task.actuator.config
@@ -127,8 +134,7 @@ def linearise(
     for name in ("inputs",) if follows else ("reference", "inputs"):
         if getattr(task, name) is not None:
             raise ConfigError(name, f"expected none for a fixed goal, {task.name!r} has {name}.")
-    dynamics = copy.deepcopy(dynamics).to(device="cpu", dtype=torch.float64)
-    step = physical_step(dynamics)
+    step = exact_step(dynamics)
     state, action = _rest(task, step, goal, follows)
     at, move, moved = state, step, _moved(task) if registers else ()
     if moved:
@@ -205,8 +211,8 @@ def _rest(
         ]
     reasons = []
     for state in places:
-        state, action, drift = _trim(task, step, state, free)
-        if drift > _DRIFT:
+        state, action, drift = trim(task, step, state, free)
+        if drift > DRIFT:
             reasons.append(f"the model drifts from {_text(state)} by {drift:.2g} half-ranges")
         elif goal is None and _is_exceeded(task, state, action):
             reasons.append(f"other states earn more than {_text(state)}")
@@ -215,7 +221,7 @@ def _rest(
     raise ConfigError("goal", f"expected a state to stay in: {'; '.join(reasons)}.")
 
 
-def _trim(
+def trim(
     task: Task, step: Step, start: Tensor, free: Sequence[int] = ()
 ) -> tuple[Tensor, Tensor, float]:
     """A state, the action ``[m]`` that keeps it best, and how far it still moves in a step.
@@ -233,8 +239,11 @@ def _trim(
     with torch.no_grad():
         for _ in range(5):
             sought = torch.cat([state[places], action])
+            off = drift(sought)
+            if off.abs().max() < _STILL:
+                break
             slope = jacfwd(drift)(sought)
-            sought = sought - torch.linalg.pinv(slope, rtol=1e-9) @ drift(sought)
+            sought = sought - torch.linalg.pinv(slope, rtol=1e-9) @ off
             state = state.index_put((places,), sought[:count])
             action = task.clip_action(sought[count:])
         left = drift(torch.cat([state[places], action])).abs().max().item()

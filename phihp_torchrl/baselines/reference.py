@@ -31,3 +31,19 @@ def middle(task: Task) -> tuple[float, ...]:
     for name, low, high in zip(reference.names, reference.low, reference.high, strict=True):
         found[task.system.state_names.index(name)] = (low + high) / 2
     return tuple(found)
+
+
+def held(task: Task, physical: Tensor, at: Tensor) -> Tensor:
+    """The state of the task at rest, with a reference that stays at another state's components.
+
+    Args:
+        task: the task.
+        physical: physical components of the state, ``[n]``.
+        at: physical components that the reference has, ``[n]``.
+    """
+    state = task.at_rest(physical)
+    if not (places := followed(task)):
+        return state
+    assert task.reference is not None
+    value = at[list(places.values())]
+    return task.with_signals(state, task.reference.read(value, "reference", []))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.func import hessian
 
 from phihp_torchrl.baselines.point import LinearModel, Matrix, half_ranges
+from phihp_torchrl.baselines.reference import followed, held
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.tasks import Task
 
@@ -18,6 +19,8 @@ _STATE_FLOOR = 0.01
 """The least weight of a half-range of the state, as a share of the largest weight."""
 _ACTION_FLOOR = 0.1
 """The least weight of a full action: cheaper ones saturate near the goal and lose it sooner."""
+_REACH = 0.05
+"""Half-ranges to either side of two components together, in which curvatures of secants are."""
 
 
 class Weights(NamedTuple):
@@ -56,30 +59,61 @@ def find_weights(
 
 
 def reward_weights(task: Task, point: LinearModel) -> Weights:
-    """Weights from the second derivative of the reward at the goal, in physical units.
+    """Weights from the second derivative of the reward at a point, in physical units.
 
     A reward is written as ``reward(s, a, s)``, of a state that stays. Directions in which it curves
     upward count as flat.
+
+    On a reference, which then has the values of the point, curvatures are secants across a tenth of
+    the half-ranges: rewards of the size of an error have a kink there. If one is flat even so, what
+    is to be followed weighs as much as the heaviest.
     """
     ranges, reach = half_ranges(task)
-    state, action = task.split(point.state)[0], point.action
+    state, action = point.state[: len(ranges)], point.action
+    places = list(followed(task).values())
 
     def of_state(z: Tensor) -> Tensor:
-        s = state + ranges * z
-        return -task.reward(s, action, s)
+        whole = held(task, state + ranges * z, state)
+        return -task.earned(whole, action, whole)
 
     def of_action(u: Tensor) -> Tensor:
-        return -task.reward(state, action + reach * u, state)
+        whole = held(task, state, state)
+        return -task.earned(whole, action + reach * u, whole)
 
-    q = _positive(hessian(of_state)(torch.zeros_like(state)))
-    r = _positive(hessian(of_action)(torch.zeros_like(action)))
+    curvature = _secants if places else hessian
+    q = _positive(curvature(of_state)(torch.zeros_like(state)))
+    r = _positive(curvature(of_action)(torch.zeros_like(action)))
     unit = max(np.linalg.eigvalsh(q).max(), np.linalg.eigvalsh(r).max())
     if not unit > 1e-9:
-        q, r, unit = np.eye(len(q)), np.eye(len(r)), 1.0
-    q = q / unit + _STATE_FLOOR * np.eye(len(q))
+        unit = 1.0
+        if not places:
+            q, r = np.eye(len(q)), np.eye(len(r))
+    q = q / unit
+    for place in places:
+        if q[place, place] < _STATE_FLOOR:
+            q[place, place] = 1.0
+    q = q + _STATE_FLOOR * np.eye(len(q))
     r = r / unit + _ACTION_FLOOR * np.eye(len(r))
     across, along = ranges.numpy(), reach.numpy()
     return Weights(q / np.outer(across, across), r / np.outer(along, along), float(unit))
+
+
+def _secants(function: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+    """Second differences of a function, ``[n] -> [n, n]``, in the place of its hessian."""
+
+    def curvature(at: Tensor) -> Tensor:
+        ways = _REACH * torch.eye(len(at)).to(at)
+        rows = [
+            function(at + a + b)
+            - function(at + a - b)
+            - function(at - a + b)
+            + function(at - a - b)
+            for a in ways
+            for b in ways
+        ]
+        return torch.stack(rows).unflatten(0, (len(at), len(at))) / (2.0 * _REACH) ** 2
+
+    return curvature
 
 
 def _positive(curvature: Tensor) -> Matrix:
