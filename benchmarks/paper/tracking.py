@@ -1,12 +1,14 @@
-"""A motor's speed on a random reference: agents beside a PI controller that was tuned for it.
+"""A motor's speed on a random reference: agents beside PI controllers and regulators.
 
     python benchmarks/paper/tracking.py --seeds 100 101
 
-Learns ``rigs/motor.py`` for each seed and each preview, from real steps of its simulated world. The
-PI controller, with a clamped integral, is tuned in that same world on an episode seed below 100,
-once for the least RMS error and once for the highest return, which counts small errors more. All
-are then measured on episodes from 1,000,000 on: in the world as it is, with a constant torque of
-the load, and with another inertia, none of which anybody is told. Writes results/tracking/.
+Learns ``rigs/motor.py`` for each seed and each preview, from real steps of its simulated world. A
+PI controller, with a clamped integral, and an LQR with integral action, of that world's own
+equations, are tuned in that same world on an episode seed below 100: each once for the least RMS
+error and once for the highest return, which counts small errors more. Beside each agent plays an
+LQR as evaluations have it too, built in the agent's learned model and not tuned. All are then
+measured on episodes from 1,000,000 on: in the world as it is, with a constant torque of the load,
+and with another inertia, none of which anybody is told. Writes results/tracking/.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from scipy.optimize import minimize
@@ -27,6 +29,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from phihp_torchrl import Agent, Task, get_task, learn, load_agent, save_agent
+from phihp_torchrl.baselines import LQI
 from phihp_torchrl.evaluation import EVALUATION_SEED, markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
 from phihp_torchrl.trainers import import_plugins
@@ -67,7 +70,11 @@ SETTLED: dict[str, Any] = {
 
 Chosen by ``tracking_search.py`` with episodes of a training seed."""
 
+LQR = "LQR with integral action"
+
 Policy = Callable[[TensorDict], TensorDict]
+Criterion = Callable[[Tensor, Tensor], float]
+"""What is to be least, of speeds and references ``[steps, episodes]``."""
 
 
 class PI:
@@ -159,20 +166,61 @@ def loss(speeds: Tensor, references: Tensor) -> float:
     return -motor.reward(speed, speed, speed, reference=reference).mean().item()
 
 
-def tune(task: Task, episodes: int, criterion: Callable[[Tensor, Tensor], float]) -> PI:
-    """The PI controller that is best by a criterion, in the world as it is."""
+def regulator(task: Task, effort: float, integral_time: float) -> LQI:
+    """The LQR with integral action of the world as it is.
+
+    Args:
+        task: the task.
+        effort: weight of a full action, where the largest of a half-range of the state is 1.
+        integral_time: seconds in which its integral acts.
+    """
+    weights = (effort / task.bounds.scale.square()).tolist()
+    dynamics = world_of(task, {}).oracle()
+    return LQI.from_model(task, dynamics, action_weights=weights, integral_time=integral_time)
+
+
+class Tunable(NamedTuple):
+    """A controller of two positive numbers.
+
+    Args:
+        make: from the task and the numbers to the controller.
+        numbers: what they are called.
+        starts: from where they are sought.
+    """
+
+    make: Callable[[Task, float, float], Policy]
+    numbers: tuple[str, str]
+    starts: tuple[tuple[float, float], ...]
+
+
+TUNABLE = {
+    "PI": Tunable(PI, ("kp", "ki"), ((0.5, 1.0), (2.0, 5.0))),
+    LQR: Tunable(regulator, ("effort", "integral time"), ((0.1, 0.15), (0.01, 0.1))),
+}
+CRITERIA: dict[str, Criterion] = {"least RMS error": rms, "highest return": loss}
+
+
+def tune(
+    kind: Tunable, task: Task, episodes: int, criterion: Criterion, tries: int = 30
+) -> dict[str, float]:
+    """The numbers of a controller that are best by a criterion, in the world as it is.
+
+    Args:
+        kind: the controller.
+        task: the task.
+        episodes: number of episodes.
+        criterion: what is to be least.
+        tries: how often it is played from each start.
+    """
 
     def cost(logs: Any) -> float:
-        kp, ki = (math.exp(x) for x in logs)
-        played = play(PI(task, kp, ki), task, {}, episodes=episodes, seed=TUNING_SEED)
-        return criterion(*played)
+        policy = kind.make(task, *(math.exp(x) for x in logs))
+        return criterion(*play(policy, task, {}, episodes=episodes, seed=TUNING_SEED))
 
-    tried = [
-        minimize(cost, [math.log(kp), math.log(ki)], method="Nelder-Mead", options={"maxfev": 30})
-        for kp, ki in ((0.5, 1.0), (2.0, 5.0))
-    ]
+    options = {"method": "Nelder-Mead", "options": {"maxfev": tries}}
+    tried = [minimize(cost, [math.log(x) for x in start], **options) for start in kind.starts]
     best = min(tried, key=lambda found: found.fun)
-    return PI(task, *(math.exp(x) for x in best.x))
+    return {name: math.exp(x) for name, x in zip(kind.numbers, best.x, strict=True)}
 
 
 def measure(policy: Policy, task: Task, episodes: int) -> dict[str, dict[str, float]]:
@@ -239,9 +287,9 @@ def write(result: Mapping[str, Any], results: Path) -> None:
     commits = sorted({commit_text(r["origin"]) for r in every})
     machines = sorted({machine_text(r["origin"]) for r in every})
     gains = "; ".join(
-        f"{name}: kp = {g['kp']:.3g}, ki = {g['ki']:.3g}"
+        f"{name}: {', '.join(f'{number} = {value:.3g}' for number, value in found.items())}"
         for r in every
-        for name, g in r.get("gains", {}).items()
+        for name, found in r.get("gains", {}).items()
     )
     (results / "README.md").write_text(
         "# A motor's speed on a random reference\n\n"
@@ -249,9 +297,11 @@ def write(result: Mapping[str, Any], results: Path) -> None:
         f"{every[0]['episodes']} episodes of evaluation. The RMS error is of random references of "
         "steps, ramps and sines. Steady errors are of constant references: the mean error of the "
         "last second, its size on average and at most over the episodes; the ripple is the "
-        f"standard deviation within that second. PI controllers are tuned in the world as it "
-        f"is ({gains}); nobody is told of other worlds. *motor-preview* knows the "
-        "reference of the next five steps, which a PI controller has no use for.\n\n"
+        f"standard deviation within that second. Controllers with a criterion in their names "
+        f"are tuned by it in the world as it is ({gains}), an LQR of that world's own equations; "
+        "one with a seed is built in the learned model of that agent, and not tuned. Nobody is "
+        "told of other worlds. *motor-preview* knows the reference of the next five steps, which "
+        "PI controllers and LQR have no use for.\n\n"
         f"{markdown_table(head, rows)}\n"
         f"Commits: {', '.join(commits)}. Machines: {'; '.join(machines)}, shared with other work.\n"
     )
@@ -267,6 +317,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--tasks", nargs="*", choices=TASKS, default=list(TASKS))
     parser.add_argument("--updates", type=int, default=2500)
     parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--tries", type=int, default=30, help="plays of a tuning, from each start")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--agents", type=Path, default=AGENTS, help="where agents are kept")
     parser.add_argument("--models", type=Path, help="runs that have done the phase model")
@@ -276,17 +327,22 @@ def main(words: Sequence[str] | None = None) -> None:
     import_plugins([f"{RIGS / 'motor.py'}"])
     episodes = arguments.episodes
     task = get_task("motor")
-    controllers = {
-        f"PI, {by}": tune(task, episodes, criterion)
-        for by, criterion in {"least RMS error": rms, "highest return": loss}.items()
+    gains = {
+        f"{name}, {by}": tune(kind, task, episodes, criterion, arguments.tries)
+        for name, kind in TUNABLE.items()
+        for by, criterion in CRITERIA.items()
+    }
+    measured = {
+        name: measure(TUNABLE[name.split(", ")[0]].make(task, *found.values()), task, episodes)
+        for name, found in gains.items()
     }
     write(
         {
             "task": "motor",
             "seed": None,
-            "gains": {name: {"kp": pi.kp, "ki": pi.ki} for name, pi in controllers.items()},
+            "gains": gains,
             "episodes": episodes,
-            "measured": {name: measure(pi, task, episodes) for name, pi in controllers.items()},
+            "measured": measured,
             "origin": describe_origin(0),
         },
         arguments.results,
@@ -296,11 +352,15 @@ def main(words: Sequence[str] | None = None) -> None:
             agent = train(name, seed, arguments.updates, arguments.agents, arguments.models)
             task, config = get_task(name), agent.planner_config
             assert config is not None
+            assert agent.dynamics is not None
             settled = agent.with_planner(replace(config, **SETTLED))
             measured = {
                 f"planner, seed {seed}": measure(agent, task, episodes),
                 f"planner that settles, seed {seed}": measure(settled, task, episodes),
                 f"actor, seed {seed}": measure(agent.actor_alone(), task, episodes),
+                f"{LQR}, seed {seed}": measure(
+                    LQI.from_model(task, agent.dynamics), task, episodes
+                ),
             }
             write(
                 {

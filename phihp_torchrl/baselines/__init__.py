@@ -5,6 +5,7 @@ from __future__ import annotations
 from phihp_torchrl.baselines.controller import Controller
 from phihp_torchrl.baselines.energy_shaping import EnergyShaping, PumpConfig
 from phihp_torchrl.baselines.ilqr import ILQR, ILQRConfig
+from phihp_torchrl.baselines.lqi import LQI
 from phihp_torchrl.baselines.lqr import LQR
 from phihp_torchrl.baselines.pid import PID
 from phihp_torchrl.baselines.registry import (

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.func import grad, jvp
 
-from phihp_torchrl.baselines.lqr import LQR, reward_weights
+from phihp_torchrl.baselines.lqr import LQR
 from phihp_torchrl.baselines.point import physical_step
+from phihp_torchrl.baselines.weights import reward_weights
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.tasks import Task, Transition
 

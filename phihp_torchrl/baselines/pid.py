@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from phihp_torchrl.baselines.controller import Controller
-from phihp_torchrl.baselines.lqr import is_smooth
-from phihp_torchrl.baselines.point import LinearModel, half_ranges, linearise
+from phihp_torchrl.baselines.point import LinearModel, half_ranges, is_smooth, linearise
+from phihp_torchrl.baselines.reference import followed, middle, present
 from phihp_torchrl.baselines.tuning import Gains, pair, tune
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.tasks import Task
@@ -67,7 +67,7 @@ class PID(Controller):
                 )
             )
         self._integral: Tensor | None = None
-        self._followed = _followed(point.task)
+        self._followed = followed(point.task)
 
     @classmethod
     def from_model(
@@ -96,12 +96,12 @@ class PID(Controller):
             ConfigError: for an unknown name, where the task has no goal, and where no gains give a
                 stable loop; the message names the component.
         """
-        followed = _followed(task)
-        if followed and goal is None:
-            goal = _middle(task)
-        point = linearise(task, dynamics, goal, registers=is_smooth(task), follows=list(followed))
+        follows = list(followed(task))
+        if follows and goal is None:
+            goal = middle(task)
+        point = linearise(task, dynamics, goal, registers=is_smooth(task), follows=follows)
         if components is None:
-            components = pair(point, half_ranges(task)[0].numpy(), list(followed) or None)
+            components = pair(point, half_ranges(task)[0].numpy(), follows or None)
             if not components:
                 raise ConfigError("components", "expected some that an action moves, got none.")
         known = (("components", components, task.system.action_names),
@@ -120,7 +120,7 @@ class PID(Controller):
         at = self.point.state[: physical.shape[-1]].to(state)
         if self._followed:
             at = at.expand_as(physical).clone()
-            at[..., list(self._followed.values())] = _present(self.task, registers)
+            at[..., list(self._followed.values())] = present(self.task, registers)
         error = -self.task.system.difference(physical, at)
         action = self.point.action.to(state).expand(*state.shape[:-1], -1)
         sums = self._recall(error, starts)
@@ -149,27 +149,3 @@ class PID(Controller):
         if kept is None or kept.shape != zero.shape or kept.device != zero.device:
             return zero
         return kept if starts is None else torch.where(starts.unsqueeze(-1), zero, kept)
-
-
-def _followed(task: Task) -> dict[str, int]:
-    """The components of the state that a task's reference is of, and their places."""
-    names = () if task.reference is None else task.reference.names
-    known = task.system.state_names
-    return {name: known.index(name) for name in names} if set(names) <= set(known) else {}
-
-
-def _present(task: Task, registers: Tensor) -> Tensor:
-    """The present value of the reference, ``[*batch, k]``."""
-    assert task.outside is not None
-    return task.outside.values(registers)["reference"]
-
-
-def _middle(task: Task) -> tuple[float, ...]:
-    """The middle of the wide box, and of the reference in what that is of."""
-    box, reference = task.coverage or task.reset, task.reference
-    assert reference is not None
-    ends = zip(box.low, box.high, strict=True)
-    middle = [(low + high) / 2 for low, high in ends]
-    for name, low, high in zip(reference.names, reference.low, reference.high, strict=True):
-        middle[task.system.state_names.index(name)] = (low + high) / 2
-    return tuple(middle)

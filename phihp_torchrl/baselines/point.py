@@ -13,14 +13,16 @@ from torch import Tensor, nn
 from torch.func import jacfwd
 
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.tasks import Step, Task
+from phihp_torchrl.tasks import DisturbancePart, SignalPart, Step, Task
 
 Matrix = NDArray[np.float64]
 
 _SECANT = 0.05
 """Half-ranges to either side of the goal across which slopes of the state are taken."""
-_DRIFT = 0.01
+DRIFT = 0.01
 """The largest motion in one step, in half-ranges of the state, of what counts as a rest."""
+_STILL = 1e-12
+"""The motion below which a rest is not sought any better."""
 _SAMPLES = 512
 """States of the wide box whose rewards are compared with that of a goal."""
 
@@ -30,14 +32,15 @@ class LinearModel:
     """A task's one step around a state at rest: ``z[k+1] = A z[k] + B u[k]``.
 
     ``z`` is the difference to the point's state, of angles on the circle, and ``u`` that to its
-    action. ``z`` has the registers of the task too, unless they were left out.
+    action. ``z`` has the registers of the task that an action moves too, unless they were left out.
 
     Args:
         task: the task.
-        state: the state at rest, float64 ``[n]``.
+        state: the state at rest, float64 ``[n]``, of the components of ``z``.
         action: the action that keeps it there, float64 ``[m]``.
         a: the matrix A, ``[n, n]``.
         b: the matrix B, ``[n, m]``.
+        moved: the registers in ``z``, by their places among those of the task.
     """
 
     task: Task
@@ -45,15 +48,29 @@ class LinearModel:
     action: Tensor
     a: Matrix
     b: Matrix
+    moved: tuple[int, ...] = ()
 
-    def difference(self, state: Tensor) -> Tensor:
-        """``state - self.state``, in the dtype and on the device of ``state`` ``[*batch, n]``."""
-        physical, registers = self.task.split(state)
-        at, under_way = self.task.split(self.state.to(state))
-        delta = self.task.system.difference(physical, at)
-        if not under_way.shape[-1]:
+    def difference(self, state: Tensor, at: Tensor | None = None) -> Tensor:
+        """``z`` of a state, in its dtype and on its device.
+
+        Args:
+            state: states of the task, ``[*batch, N]``.
+            at: states of the task in place of the point's, ``[*batch, N]``.
+        """
+        own = self._own(state)
+        at = self.state.to(state) if at is None else self._own(at)
+        size = self.task.system.state_dim
+        delta = self.task.system.difference(own[..., :size], at[..., :size])
+        if not self.moved:
             return delta
-        return torch.cat([delta, registers - under_way], -1)
+        return torch.cat([delta, own[..., size:] - at[..., size:]], -1)
+
+    def _own(self, state: Tensor) -> Tensor:
+        """The components of a state of the task that ``z`` has."""
+        physical, registers = self.task.split(state)
+        if not self.moved:
+            return physical
+        return torch.cat([physical, registers[..., list(self.moved)]], -1)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -65,6 +82,17 @@ class LinearModel:
 def physical_step(dynamics: nn.Module) -> Step:
     """The step of a model for what acts on the system, without clipping."""
     return getattr(dynamics, "step", dynamics)
+
+
+def exact_step(dynamics: nn.Module) -> Step:
+    """The same of a copy of the model, in double precision on the CPU."""
+    return physical_step(copy.deepcopy(dynamics).to(device="cpu", dtype=torch.float64))
+
+
+def is_smooth(task: Task) -> bool:
+    """Whether a small command has an effect in proportion, in a task's actuator."""
+    numbers = {} if task.actuator is None else task.actuator.config
+    return not {"dead_zone", "slew"} & set(numbers)
 
 
 def half_ranges(task: Task) -> tuple[Tensor, Tensor]:
@@ -93,9 +121,9 @@ def linearise(
         dynamics: the model, ``(state, action) -> next state``.
         goal: the physical state at which to linearise. Defaults to the task's goal: the centre of
             its box ``goal``, or else a state at rest whose reward no state of the wide box exceeds.
-        registers: whether the task's registers, such as commands under way and the last action,
-            belong to the state, those of a reference apart. With an estimated disturbance they are
-            left out.
+        registers: whether the registers that an action moves, such as commands under way and the
+            last action, belong to the state. Those of a reference and of an estimated disturbance
+            never do.
         follows: components that follow the task's reference, and have the values of ``goal``; the
             others are those at which the model rests there, sought from ``goal``.
 
@@ -106,12 +134,10 @@ def linearise(
     for name in ("inputs",) if follows else ("reference", "inputs"):
         if getattr(task, name) is not None:
             raise ConfigError(name, f"expected none for a fixed goal, {task.name!r} has {name}.")
-    dynamics = copy.deepcopy(dynamics).to(device="cpu", dtype=torch.float64)
-    step = physical_step(dynamics)
+    step = exact_step(dynamics)
     state, action = _rest(task, step, goal, follows)
-    at, move = state, step
-    # An estimated disturbance is no action's to move.
-    if registers and task.register_count and task.disturbance is None:
+    at, move, moved = state, step, _moved(task) if registers else ()
+    if moved:
         at = torch.cat([state, task.registers.rest(action)])
         move = _with_registers(task, step)
     with torch.no_grad():
@@ -119,12 +145,19 @@ def linearise(
         a = _with_secants(task, move, at, action, slope_a)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise ConfigError("dynamics", "expected finite derivatives at the goal, got others.")
-    if len(at) > len(state) and task.outside is not None:  # these are the first of the registers
-        outside = slice(len(state), len(state) + task.outside.size)
-        at = torch.cat([at[: outside.start], at[outside.stop :]])
-        a, b = np.delete(a, outside, 0), np.delete(b, outside, 0)
-        a = np.delete(a, outside, 1)
-    return LinearModel(task, at, action, a, b)
+    size = len(state)
+    kept = [*range(size), *(size + place for place in moved)]
+    return LinearModel(task, at[kept], action, a[np.ix_(kept, kept)], b[kept], moved)
+
+
+def _moved(task: Task) -> tuple[int, ...]:
+    """The places of the registers that actions move: all but signals and disturbances."""
+    places, first = list[int](), 0
+    for part, size in zip(task.registers.parts, task.registers.sizes, strict=True):
+        if not isinstance(part, (SignalPart, DisturbancePart)):
+            places += range(first, first + size)
+        first += size
+    return tuple(places)
 
 
 def _with_secants(task: Task, move: Step, at: Tensor, action: Tensor, a: Matrix) -> Matrix:
@@ -178,8 +211,8 @@ def _rest(
         ]
     reasons = []
     for state in places:
-        state, action, drift = _trim(task, step, state, free)
-        if drift > _DRIFT:
+        state, action, drift = trim(task, step, state, free)
+        if drift > DRIFT:
             reasons.append(f"the model drifts from {_text(state)} by {drift:.2g} half-ranges")
         elif goal is None and _is_exceeded(task, state, action):
             reasons.append(f"other states earn more than {_text(state)}")
@@ -188,7 +221,7 @@ def _rest(
     raise ConfigError("goal", f"expected a state to stay in: {'; '.join(reasons)}.")
 
 
-def _trim(
+def trim(
     task: Task, step: Step, start: Tensor, free: Sequence[int] = ()
 ) -> tuple[Tensor, Tensor, float]:
     """A state, the action ``[m]`` that keeps it best, and how far it still moves in a step.
@@ -206,8 +239,11 @@ def _trim(
     with torch.no_grad():
         for _ in range(5):
             sought = torch.cat([state[places], action])
+            off = drift(sought)
+            if off.abs().max() < _STILL:
+                break
             slope = jacfwd(drift)(sought)
-            sought = sought - torch.linalg.pinv(slope, rtol=1e-9) @ drift(sought)
+            sought = sought - torch.linalg.pinv(slope, rtol=1e-9) @ off
             state = state.index_put((places,), sought[:count])
             action = task.clip_action(sought[count:])
         left = drift(torch.cat([state[places], action])).abs().max().item()

@@ -12,6 +12,7 @@ from torch import nn
 from phihp_torchrl.baselines.energy import starts_low
 from phihp_torchrl.baselines.energy_shaping import EnergyShaping
 from phihp_torchrl.baselines.ilqr import ILQR
+from phihp_torchrl.baselines.lqi import LQI
 from phihp_torchrl.baselines.lqr import LQR
 from phihp_torchrl.baselines.pid import PID
 from phihp_torchrl.config import ConfigError, Registry
@@ -141,6 +142,11 @@ def check_names(names: str | Sequence[str]) -> str | tuple[str, ...]:
     return given
 
 
+def _lqr(task: Task, dynamics: nn.Module) -> TensorDictModuleBase:
+    kind = LQR if task.reference is None else LQI
+    return kind.from_model(task, dynamics)
+
+
 def _mppi(task: Task, dynamics: nn.Module) -> TensorDictModuleBase:
     config = MPPIConfig(
         planning_horizon=20, num_policy_candidates=0, num_candidates=128, select="mean"
@@ -149,7 +155,9 @@ def _mppi(task: Task, dynamics: nn.Module) -> TensorDictModuleBase:
 
 
 register_baseline(
-    "lqr", LQR.from_model, about="linear-quadratic regulator of the model at the goal"
+    "lqr",
+    _lqr,
+    about="linear-quadratic regulator at the goal, or on a reference with integral action",
 )
 register_baseline("pid", PID.from_model, about="a PID loop for each action, lambda-tuned")
 register_baseline(

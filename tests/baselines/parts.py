@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
 from phihp_torchrl.dynamics import HybridDynamics, TaskWorldModel
 from phihp_torchrl.systems import System
-from phihp_torchrl.tasks import Actuator, Box, Task
+from phihp_torchrl.tasks import Actuator, Box, Signal, Task
 
 
 class Slider(System):
@@ -31,6 +33,13 @@ class Tank(System):
         return 2.0 * action - 0.5 * state
 
 
+class Leak(Tank):
+    """A tank with a leak that the model does not know."""
+
+    def prior(self, state: Tensor, action: Tensor, constants) -> Tensor:
+        return super().prior(state, action, constants) - 1.0
+
+
 class TwoTanks(System):
     """A tank that is filled through another one, so that the inflow reaches it late."""
 
@@ -51,6 +60,10 @@ class Stray(Slider):
         return torch.cat([first, 0.3 * state[..., 2:]], -1)
 
 
+def follow(state: Tensor, action: Tensor, next_state: Tensor, reference: Tensor) -> Tensor:
+    return -(next_state[..., 0] - reference[..., 0]).square()
+
+
 def squared(state: Tensor, action: Tensor, next_state: Tensor) -> Tensor:
     return -(state.square().sum(-1) + 0.5 * action.square().sum(-1))
 
@@ -67,6 +80,13 @@ def task_of(system: System, actuator: Actuator | None = None, **options) -> Task
         reward=squared,
         actuator=actuator,
         **options,
+    )
+
+
+def following(system: System, name: str = "level", **options) -> Task:
+    """A task to keep a component at a reference between -1 and 3."""
+    return replace(
+        task_of(system), reward=follow, reference=Signal((name,), (-1.0,), (3.0,), **options)
     )
 
 

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from phihp_torchrl import ConfigError, HybridDynamics, get_task
 from phihp_torchrl.baselines import LQR
-from phihp_torchrl.tasks import Actuator
+from phihp_torchrl.tasks import Actuator, Disturbance
 
 from .parts import Slider, Stray, Tank, play, prior_of, task_of
 
@@ -68,6 +68,20 @@ def test_it_reckons_with_dead_time() -> None:
     start = late.at_rest(torch.tensor([0.1, 0.0]))
     ends = [play(each, late, start, 150, dynamics)[-1, :2].norm() for each in (knows, blind)]
     assert ends[0] < 1e-3 < 0.02 < ends[1]  # the blind one keeps oscillating
+
+
+def test_it_reckons_with_dead_time_beside_an_estimated_disturbance() -> None:
+    late = task_of(Slider(), Actuator(delay_steps=3.0))
+    disturbed = replace(late, disturbance=Disturbance(high={"x_dot": 1.0}), action_rate_cost=0.1)
+    dynamics = prior_of(late)
+    lqr = LQR.from_model(disturbed, dynamics)
+    alone = LQR.from_model(replace(late, action_rate_cost=0.1), dynamics)
+    np.testing.assert_allclose(lqr.gain, alone.gain, rtol=1e-9)
+    state = disturbed.at_rest(torch.tensor([[0.1, 0.0]]))
+    state[:, 2] = 0.7  # the estimate, which it has no use for
+    state[:, 3:6] = torch.tensor([1.0, 2.0, 3.0])
+    own = torch.cat([state[:, :2], state[:, 3:]], -1)
+    torch.testing.assert_close(lqr.act(state), alone.act(own))
 
 
 def test_where_a_small_command_does_nothing_it_takes_the_physical_part() -> None:

@@ -10,16 +10,9 @@ from tensordict import TensorDict
 
 from phihp_torchrl import ConfigError, HybridDynamics, get_task
 from phihp_torchrl.baselines import PID
-from phihp_torchrl.tasks import Actuator, Signal
+from phihp_torchrl.tasks import Actuator
 
-from .parts import Slider, Stray, Tank, TwoTanks, play, prior_of, task_of
-
-
-class Leak(Tank):
-    """A tank with a leak that the model does not know."""
-
-    def prior(self, state, action, constants):
-        return super().prior(state, action, constants) - 1.0
+from .parts import Leak, Slider, Stray, Tank, TwoTanks, following, play, prior_of, task_of
 
 
 def test_its_integral_leaves_no_offset() -> None:
@@ -107,17 +100,6 @@ def test_what_is_wrong_is_named() -> None:
 
 
 # References.
-
-
-def follow(state, action, next_state, reference):
-    return -(next_state[..., 0] - reference[..., 0]).square()
-
-
-def following(system, name="level", **options):
-    """A task to keep a component at a reference between -1 and 3."""
-    return replace(
-        task_of(system), reward=follow, reference=Signal((name,), (-1.0,), (3.0,), **options)
-    )
 
 
 @pytest.mark.parametrize("preview", [0, 3])

@@ -42,7 +42,7 @@ EXTRAS = {
              {"lqr", "pid", "energy"}),
     "disturbance": ({"disturbance": Disturbance({"theta_dot": 1.0})}, {"lqr", "pid", "energy"}),
     "reference": ({"reference": Signal(("theta",), (-1.0,), (1.0,)), "reward": following},
-                  {"pid", "energy"}),
+                  {"lqr", "pid", "energy"}),
 }  # fmt: skip
 
 
