@@ -63,6 +63,7 @@ OURS = {
     "policy_noise": 0.2,
     "policy_noise_clip": 0.6,
     "init_std": 1.0,
+    "noise_beta": 0.0,
     "select": "mean",
     "num_kept_elites": 0,
     "compare_with_actor": True,
