@@ -92,7 +92,7 @@ class Contest:
         agent = self.agent.with_planner(replace(self.agent.planner_config, **self.ways[name]))
         seed = self.seed + lot.start
         found = play(agent, self.world_model, self.starts[lot], seed=seed)
-        self.spent += self._cost(count, len(found.changes))
+        self.spent += self._cost(name, count, len(found.changes))
         before = self._played.get(name, [[], []])
         new = (found.total.tolist(), found.chatter().tolist())
         self._played[name] = [[*old, *more] for old, more in zip(before, new, strict=True)]
@@ -105,8 +105,8 @@ class Contest:
         """
         more = max(self.episodes, KNOWN - self.episodes)
         most = min(more, self.config.max_episodes - self.episodes)
-        left = (self.config.budget - self.spent) / len(self.playing)
-        paid = (n for n in range(most, 0, -1) if self._cost(n, self._length) <= left)
+        left = self.config.budget - self.spent
+        paid = (n for n in range(most, 0, -1) if self._cost_of_all(n) <= left)
         more = max(next(paid, 0), min(_ALONE - self.episodes, most))
         self.episodes += max(more, 0)
         return more > 0
@@ -178,11 +178,16 @@ class Contest:
         if played is not None:
             return self.episodes - len(played[0])
         optional = list(self.ways).index(name) >= _IN_ANY_CASE
-        dear = self.spent + self._cost(self.episodes, self._length) > of_ways(self.config)
+        cost = self._cost(name, self.episodes, self._length)
+        dear = self.spent + cost > of_ways(self.config)
         return 0 if optional and dear else self.episodes
 
-    def _cost(self, episodes: int, steps: float) -> float:
-        return steps * self.price.plan(episodes)
+    def _cost_of_all(self, episodes: int) -> float:
+        return sum(self._cost(name, episodes, self._length) for name in self.playing)
+
+    def _cost(self, name: str, episodes: int, steps: float) -> float:
+        planner = replace(self.price.planner, **self.ways[name])
+        return steps * replace(self.price, planner=planner).plan(episodes)
 
 
 def _way(played: Played, episodes: int | None = None) -> Way:
