@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from phihp_torchrl.config import METHODS, choices
-from phihp_torchrl.trainers import PHASES, run
+from phihp_torchrl.trainers import PHASES, calibrate, run
 
 from .run_parts import CONFIG
 from .tally import register_tally
@@ -28,3 +28,9 @@ def tally(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     monkeypatch.setattr(choices, "_OFFERED", dict(choices._OFFERED))
     register_tally()
+
+
+@pytest.fixture
+def restless(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No actor is taken to rest."""
+    monkeypatch.setattr(calibrate, "RESTS", -1.0)
