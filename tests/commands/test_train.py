@@ -115,3 +115,19 @@ def test_what_is_wrong_is_no_run(phihp: Command, place: Path, words: list[str]) 
         phihp("train", *MODEL, *words)
     assert error.value.code
     assert not (place / "outputs").exists()
+
+
+def test_the_first_line_comes_before_torch_is_loaded(place: Path) -> None:
+    code = """
+import sys
+sys.modules["torch"] = None  # importing it fails
+from phihp_torchrl.commands import main
+main(["train", "task=pendulum", "run_dir=run"])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=place, check=False
+    )
+    first, *_, last = (done.stdout + done.stderr).splitlines()
+    assert first.startswith("phihp train: loading PyTorch")
+    assert done.returncode != 0
+    assert "torch" in last

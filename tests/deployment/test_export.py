@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -148,6 +150,25 @@ def test_the_actor_as_onnx_is_loaded_again_where_it_fits(tmp_path):
     path.write_bytes(path.read_bytes() + b" ")
     with pytest.raises(AgentError, match="got another"):
         load_exported(path, LOPSIDED)
+
+
+@pytest.mark.slow
+def test_the_actor_as_onnx_runs_where_there_is_no_torch(tmp_path):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    agent = make_agent()
+    act = export_onnx(ActorModule(agent), tmp_path / "actor.onnx")
+    seen = observations(agent, 1)[0]
+    code = f"""
+import sys
+sys.modules["torch"] = None  # importing it fails
+import numpy, onnxruntime
+session = onnxruntime.InferenceSession({str(tmp_path / "actor.onnx")!r})
+observation = numpy.array({seen.tolist()}, numpy.float32)
+print(session.run(["action"], {{"observation": observation}})[0].tolist())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    torch.testing.assert_close(torch.tensor(json.loads(done.stdout)), act(seen))
 
 
 def test_machine_code_for_another_machine_is_refused(tmp_path):
