@@ -232,10 +232,11 @@ class CalibratePhase:
         contest, chosen = self.contest, self.chosen
         assert chosen is not None
         (name,) = contest.playing
-        if name == _FAST and not loses_nothing(contest.way(_FAST), contest.way(chosen.name)):
+        actor, confidence = contest.actor(contest.episodes), self.config.confidence
+        plan = contest.way(chosen.name)
+        if name == _FAST and not loses_nothing(contest.way(_FAST), plan, confidence=confidence):
             name = chosen.name
             contest.keep(name)
-        actor, confidence = contest.actor(contest.episodes), self.config.confidence
         left = {name: contest.way(name)}
         choice = choose(left, actor, confidence=confidence, doubted=self.doubted)
         enough = contest.episodes >= min(KNOWN, self.config.max_episodes)

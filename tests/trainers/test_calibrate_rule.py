@@ -123,6 +123,8 @@ def test_what_is_better_is_what_the_calm_ones_are_measured_by() -> None:
         ((996.5, 996.5, 996.5, 996.5), 0.4, False),
         ((990.0, 1010.0, 990.0, 1010.0), 0.4, False),  # as good, but nobody knows
         ((1005.0, 1025.0, 1005.0, 1025.0), 0.4, True),
+        ((1015.0, 1025.0, 1015.0, 1025.0), 0.9, True),  # rougher, and clearly better
+        ((1001.0, 1002.0, 1001.0, 1002.0), 0.9, False),  # by next to nothing
         ((math.nan, 1000.0, 1000.0, 1000.0), 0.4, False),
     ],
 )
