@@ -25,7 +25,7 @@ def choose_the_first(ways, actor, **_):
 @pytest.mark.parametrize("loses", [True, False])
 def test_the_chosen_way_keeps_the_fast_budget_if_it_loses_nothing(monkeypatch, tmp_path, loses):
     monkeypatch.setattr(calibrate_module, "choose", choose_the_first)
-    monkeypatch.setattr(calibrate_module, "loses_nothing", lambda cheap, plan: not loses)
+    monkeypatch.setattr(calibrate_module, "loses_nothing", lambda cheap, plan, **_: not loses)
     phase = finished(make_agent(planner=WIDE), path=tmp_path / "table.json")
     table = json.loads((tmp_path / "table.json").read_text())
     assert table["budget"] == ("given" if loses else "fast")
@@ -45,7 +45,7 @@ def test_a_fast_plan_that_is_behind_the_actor_does_not_act(monkeypatch):
         return Choice(name, "actor" if name == "fast" else "planner", True, 1.0, 0.1)
 
     monkeypatch.setattr(calibrate_module, "choose", choose)
-    monkeypatch.setattr(calibrate_module, "loses_nothing", lambda cheap, plan: True)
+    monkeypatch.setattr(calibrate_module, "loses_nothing", lambda cheap, plan, **_: True)
     assert finished(make_agent(planner=WIDE)).acting == "actor"
 
 
