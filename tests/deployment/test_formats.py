@@ -23,6 +23,8 @@ from .agent_parts import SMALL, act, edit_json, make_agent, observations, refuse
 AGENTS = Path(__file__).parents[2] / "results" / "agents"
 TASKS = ["acrobot", "acrobot-swingup", "cartpole", "cartpole-swingup", "pendulum"]
 TASKS += ["pendulum-swingup"]
+KEPT = {name: AGENTS / name for name in TASKS}
+KEPT["0.1.0"] = Path(__file__).parent / "agent_of_0_1_0"  # of pendulum-swingup, in version 1
 MPPI = MPPIConfig(
     planning_horizon=3, optim_steps=2, num_candidates=16, top_k=4, num_policy_candidates=4
 )
@@ -32,18 +34,18 @@ def read(directory):
     return json.loads((Path(directory) / "agent.json").read_text())
 
 
-# The agents of this repository.
+# The agents of this repository, and one that version 0.1.0 saved.
 
 
 def test_all_of_them_are_here():
     assert sorted(path.name for path in AGENTS.iterdir() if path.is_dir()) == TASKS
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", KEPT)
 def test_kept_agents_load_act_and_are_saved_in_this_format(name, tmp_path):
-    old = read(AGENTS / name)
+    old, task = read(KEPT[name]), name.replace("0.1.0", "pendulum-swingup")
     assert old["format_version"] in (1, FORMAT_VERSION)
-    agent = load_agent(AGENTS / name, task=name)
+    agent = load_agent(KEPT[name], task=task, planner=True)
     td, bounds = observations(agent, [20]), agent.task.bounds
     action = act(agent, td)
     assert (action >= bounds.low).all()
@@ -57,17 +59,17 @@ def test_kept_agents_load_act_and_are_saved_in_this_format(name, tmp_path):
     assert new["metadata"] == old["metadata"]
     for name_, value in old["planner"].items():
         assert new["planner"][name_] == value
-    loaded = load_agent(tmp_path)
+    loaded = load_agent(tmp_path, planner=True)
     assert torch.equal(act(loaded, td), action)
     assert torch.equal(act(loaded.actor_alone(), td), act(agent.actor_alone(), td))
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", KEPT)
 def test_their_actors_earn_what_they_earned(name):
     """The episodes that were recorded with them, one by one."""
-    recorded = json.loads((AGENTS / name / "evaluation.json").read_text())["actor"]
-    actor = load_agent(AGENTS / name, planner=False)
-    result = evaluate(actor, name, episodes=50, seed=evaluation_seed())
+    recorded = json.loads((KEPT[name] / "evaluation.json").read_text())["actor"]
+    actor = load_agent(KEPT[name], planner=False)
+    result = evaluate(actor, actor.task, episodes=50, seed=evaluation_seed())
     expected = torch.tensor(recorded["returns"], dtype=torch.float64)
     assert result.mean == pytest.approx(recorded["return_mean"], rel=0.02)
     # A rounding error grows on the way, in a few episodes to another swing.
