@@ -24,7 +24,7 @@ class CalibrateConfig:
             call of the model counts as a thousand more, and one of a network as one for each ten
             thousand weights, so a million takes about half a second of one core. Transitions of a
             model whose step has over 60 tensor operations count more in proportion. Three episodes
-            of two ways to plan and of the fast budget, and six of the one that is chosen, are
+            of three ways to plan and of the fast budget, and six of the one that is chosen, are
             played in any case.
 
     Raises:

@@ -26,7 +26,9 @@ _FAST_LIMITS = {
     "num_policy_candidates": 8,
 }
 # Std of the search near the previous plan, in units of the half-range.
-_NEAR, _NEARER = 0.3, 0.1
+_NEAR, _NEARER, _NEAREST = 0.3, 0.1, 0.03
+# Steps of the calmest plan, at most.
+_STILL_STEPS = 10
 
 
 def leaving(config: SearchConfig, promise: float, reward: float) -> dict[str, dict[str, Any]]:
@@ -62,26 +64,35 @@ def leaving(config: SearchConfig, promise: float, reward: float) -> dict[str, di
 
 
 def calmer(config: SearchConfig, reward: float) -> dict[str, dict[str, Any]]:
-    """Three ways to plan calmly, by name, the calmest first.
+    """Four ways to plan calmly, by name, the calmest first.
 
     A price of changes alone leaves the noise of the search: the mean of a few elites of a wide
     Gaussian. So these go on from the previous plan, keep it unless another is better, and look for
     others nearby, with noise that is smooth along the plan. The price is that of a full change of
     the action in units of a step's reward: the dearer, the calmer, and the larger the steady error
-    that a plan does not find worth a change.
+    that a plan does not find worth a change. The calmest plans ten steps ahead at most, in two
+    iterations: corrections are small there, and few candidates find them in few dimensions alone.
 
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig
         >>> ways = calmer(CEMConfig(), 1.0)
         >>> [(name, way["change_cost"], way["init_std"]) for name, way in ways.items()]
-        [('calm', 1.0, 0.1), ('mild', 0.1, 0.1), ('loose', 0.33, 0.3)]
+        [('still', 10.0, 0.03), ('calm', 1.0, 0.1), ('mild', 0.1, 0.1), ('loose', 0.33, 0.3)]
     """
-    kinds = (("calm", 1.0, _NEARER), ("mild", 0.1, _NEARER), ("loose", 1 / 3, _NEAR))
+    steps = config.planning_horizon
+    short = {"planning_horizon": min(steps, _STILL_STEPS)} if isinstance(steps, int) else {}
+    still = {**short, "optim_steps": max(config.optim_steps, 2)}
+    kinds: tuple[tuple[str, float, float, dict[str, Any]], ...] = (
+        ("still", 10.0, _NEAREST, still),
+        ("calm", 1.0, _NEARER, {}),
+        ("mild", 0.1, _NEARER, {}),
+        ("loose", 1 / 3, _NEAR, {}),
+    )
     ways = {}
-    for name, share, near in kinds:
+    for name, share, near, more in kinds:
         price, std = share * reward, min(near, config.init_std)
-        changes = _fitting(config, {"change_cost": _round(price), **_STANDING, "init_std": std})
-        if changes:
+        wanted = {"change_cost": _round(price), **_STANDING, "init_std": std, **more}
+        if changes := _fitting(config, wanted):
             ways[name] = changes
     return ways
 

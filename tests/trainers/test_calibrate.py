@@ -37,7 +37,7 @@ def test_a_plan_that_beats_a_poor_actor_acts(tmp_path):
     assert phase.acting == table["acting"] == "planner"
     assert table["planner_return"] > table["actor_return"]
     assert table["gain"] > 0
-    assert list(table["ways"])[:2] == ["given", "calm"]
+    assert list(table["ways"])[:2] == ["given", "still"]
     assert table["ways"][table["way"]]["gain"] == table["gain"]
     assert phase.parts()["planner_config"] == phase.planner_config
     assert phase.progress[0] == phase.progress[1]
@@ -124,9 +124,9 @@ def test_a_plan_that_fails_late_does_not_act(monkeypatch):
 
 
 @pytest.mark.usefixtures("restless")
-@pytest.mark.parametrize("taken", ["calm", "mild", "nothing"])
+@pytest.mark.parametrize("taken", ["still", "mild", "nothing"])
 def test_the_first_calm_way_that_is_taken_is_the_last_that_plays(monkeypatch, taken):
-    names = ["given", "calm", "mild", "loose"]
+    names = ["given", "still", "calm", "mild", "loose"]
 
     def choose(ways, actor, **_):
         name = taken if taken in ways else "given"
@@ -167,7 +167,7 @@ def test_where_plans_promise_much_beyond_an_actor_that_rests_all_ways_may_play(m
     monkeypatch.setattr(calibrate_module, "choose", choose)
     ways = list(finished(make_agent()).final["ways"])
     assert ways[:3] == ["given", "leaving", "priced"]
-    assert "calm" in ways
+    assert "still" in ways
 
 
 def test_where_models_disagree_the_settings_stay_as_given(caplog):

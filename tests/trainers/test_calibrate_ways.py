@@ -14,7 +14,7 @@ from phihp_torchrl.trainers.calibrate_ways import calmer, faster, leaving
 
 def test_each_way_fits_the_settings_and_changes_them():
     ways = calmer(CEMConfig(), 0.5)
-    assert list(ways) == ["calm", "mild", "loose"]
+    assert list(ways) == ["still", "calm", "mild", "loose"]
     for changes in ways.values():
         assert replace(CEMConfig(), **changes) != CEMConfig()
     alone = leaving(CEMConfig(), 1.234, 0.5)
@@ -22,6 +22,9 @@ def test_each_way_fits_the_settings_and_changes_them():
     assert replace(CEMConfig(), **alone["priced"]).keep_incumbent
     known = replace(CEMConfig(), warm_start=True)
     assert "warm_start" not in calmer(known, 0.5)["calm"]
+    far = calmer(CEMConfig(50, optim_steps=1), 0.5)
+    assert (far["still"]["planning_horizon"], far["still"]["optim_steps"]) == (10, 2)
+    assert "planning_horizon" not in far["calm"]
 
 
 def test_a_planner_is_asked_only_for_what_it_has():
@@ -42,7 +45,7 @@ def test_what_the_settings_refuse_is_no_way():
 
 def test_where_plans_promise_nothing_there_is_no_margin_to_try():
     assert leaving(CEMConfig(), 1e-4, 0.5) == {}
-    narrow = calmer(replace(CEMConfig(), init_std=0.05), 0.5)
+    narrow = calmer(replace(CEMConfig(), init_std=0.02), 0.5)
     assert all("init_std" not in changes for changes in narrow.values())
 
 
