@@ -82,7 +82,7 @@ def first_episodes(config: CalibrateConfig, price: Price, steps: float, ways: in
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig
         >>> config = CalibrateConfig()
-        >>> [first_episodes(config, Price(CEMConfig(steps)), 500, 4) for steps in (3, 5, 10)]
+        >>> [first_episodes(config, Price(CEMConfig(steps)), 500, 4) for steps in (5, 10, 20)]
         [6, 6, 3]
     """
     for episodes in range(config.episodes, min(_LEAST, config.episodes), -1):
