@@ -30,8 +30,8 @@ from phihp_torchrl.planners.problem import Problem
 from phihp_torchrl.planners.search import SearchConfig
 from phihp_torchrl.tasks import ActionBounds
 
-# Mean change of an actor's sequence from step to step, in half-ranges, up to which it rests.
-_REST = 0.02
+RESTS = 0.02
+"""Mean change of the action from step to step, in half-ranges, up to which one rests."""
 
 
 @dataclass(frozen=True)
@@ -216,10 +216,8 @@ def cem_plan(
     if compare:
         # The actor's sequence, unless the plan is better; the best candidate if its score is bad.
         rival = own.where(own.scores > BAD, best)
-        margin: Any = s.actor_margin
-        if s.margin_at_rest:
-            margin = margin * _rests(own.actions, bounds)
-        chosen = chosen.where(chosen.scores > own.scores + margin, rival)
+        asked = _rests(own.actions, bounds) if s.margin_at_rest else 1.0
+        chosen = chosen.where(chosen.scores > own.scores + s.actor_margin * asked, rival)
     chosen = chosen.where(best.scores > BAD, Pool(rescue, best.scores))
     actions = chosen.actions[:, 0].transpose(0, 1)
     return Plan(actions.reshape(*batch, *actions.shape[1:]), chosen.scores.reshape(batch))
@@ -250,10 +248,10 @@ def _first_candidates(
 
 
 def _rests(actions: Tensor, bounds: ActionBounds) -> Tensor:
-    """1 where sequences ``[H, N, B, m]`` change next to nothing from step to step, 0 elsewhere."""
+    """Whether sequences ``[H, N, B, m]`` change next to nothing from step to step, ``[N, B]``."""
     changes = (actions[1:] - actions[:-1]).abs() / bounds.scale
     mean = changes.sum((0, -1)) / (max(len(changes), 1) * actions.shape[-1])
-    return (mean <= _REST).to(actions)
+    return mean <= RESTS
 
 
 def _refit(elites: Pool, center: Tensor, std: Tensor, min_std: Tensor) -> tuple[Tensor, Tensor]:

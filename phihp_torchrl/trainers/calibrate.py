@@ -12,11 +12,11 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from phihp_torchrl.deployment import Agent
-from phihp_torchrl.planners import SearchConfig, score_sequences
+from phihp_torchrl.planners import RESTS, SearchConfig, score_sequences
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_contest import KNOWN, Contest
 from phihp_torchrl.trainers.calibrate_report import report, summary, warn_of_doubt, write_table
-from phihp_torchrl.trainers.calibrate_rule import RESTS, Choice, choose, in_doubt, loses_nothing
+from phihp_torchrl.trainers.calibrate_rule import Choice, choose, in_doubt, loses_nothing
 from phihp_torchrl.trainers.calibrate_ways import LEAVING, calmer, faster, leaving
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.phases import Phase, register_phase

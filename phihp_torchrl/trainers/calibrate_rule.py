@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import torch
 
+from phihp_torchrl.planners import RESTS
+
 # Of the return, what smoothness may cost: it is less than anybody would notice. A plan that rests
 # where the other does not is worth a little more.
 _TRIFLE, _REST = 3e-3, 1e-2
-RESTS = 0.02
-"""Chatter, in half-ranges, at which one rests."""
 # Returns in two models differ by more than this share of them: more than smoothness may cost.
 _ALIKE = 0.02
 # Chatter of the smoother plan, as a share of the other's; and the least difference of the two.

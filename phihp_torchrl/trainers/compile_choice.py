@@ -31,7 +31,7 @@ _RETURN_SECONDS = 5 * _STEP_SECONDS  # the steps of a compiled piece of a return
 # A step of a model alone, for as many rows as a plan has: what it takes does not grow with its
 # operations as what it saves does, for a call of a graph has its own price.
 _ALONE = _RATES["step"]
-# Lots of episodes that calibration lets plans play: of two ways, of the chosen one, and fast ones.
+# Lots of episodes that calibration lets plans play: of three ways, of the chosen one, fast ones.
 _WAYS = 5
 # Learning that may end at a plateau is taken to have this share of its updates.
 _PLATEAU = 0.9
