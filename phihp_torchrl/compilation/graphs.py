@@ -69,7 +69,7 @@ def compile_graph(
 def compile_ahead(module: nn.Module, arguments: tuple[Tensor, ...], path: str | Path) -> None:
     """Compile a call of a module, with its weights, into a package of AOTInductor.
 
-    The compiler's headers are not precompiled for it: that takes long, and pays only on a machine
+    The weights are constants of the package, which are laid out for its kernels when it is made. The compiler's headers are not precompiled for it: that takes long, and pays only on a machine
     that makes many packages.
 
     Args:
@@ -83,6 +83,7 @@ def compile_ahead(module: nn.Module, arguments: tuple[Tensor, ...], path: str | 
             program,
             package_path=str(path),
             inductor_configs={
+                "freezing": True,
                 "aot_inductor.precompile_headers": False,
                 "cpp_cache_precompile_headers": False,
             },

@@ -41,7 +41,7 @@ class _Plan(nn.Module):
         planner = self.planner
         found = planner._plan(
             *pytree.tree_unflatten(leaves, self.spec),
-            problem=planner.problem(),
+            problem=planner.problem(compiled=True),
             settings=planner.settings,
         )
         return pytree.tree_leaves(found)

@@ -145,9 +145,9 @@ class MPPIPlanner(SamplingPlanner):
             raise ConfigError("backend", "expected 'env' for an advantage_module, got 'tensor'.")
         return {**options, "backend": "env"}
 
-    def problem(self, *, prepared: bool = False) -> Problem:
+    def problem(self, *, prepared: bool = False, compiled: bool = False) -> Problem:
         """Return model, bounds, actor and value as functions, and the advantage if there is one."""
-        problem = super().problem(prepared=prepared)
+        problem = super().problem(prepared=prepared, compiled=compiled)
         if self.advantage_module is None:
             return problem
         assert isinstance(problem.model, EnvModel)

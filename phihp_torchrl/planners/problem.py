@@ -10,6 +10,14 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from phihp_torchrl.planners.roll_out import (
+    Guide,
+    Prices,
+    RolledOut,
+    at_once,
+    in_a_loop,
+    step_by_step,
+)
 from phihp_torchrl.tasks import ActionBounds
 
 
@@ -44,6 +52,8 @@ class Problem:
             an actor.
         judge: a function from first states and actions ``[H, rows, m]`` to scores ``[rows]``, which
             takes the place of equation 4 where there are no candidates of an actor; or ``None``.
+        in_loop: whether the steps of a sequence are one loop of a graph that is compiled, rather
+            than written out one after the other.
 
     Examples:
         >>> from phihp_torchrl import HybridDynamics, get_task
@@ -61,6 +71,7 @@ class Problem:
     actor: Callable[[Any], Tensor] | None = None
     value: Callable[[Any, Tensor], Tensor] | None = None
     judge: Callable[[Any, Tensor], Tensor] | None = None
+    in_loop: bool = False
 
 
 def score_sequences(
@@ -108,16 +119,16 @@ def score_sequences(
     if problem.judge is not None:
         scores = problem.judge(state, actions)
         return torch.nan_to_num(scores, *(float("-inf"),) * 3), actions
+    roll_out: Callable[..., RolledOut] = at_once if hasattr(model, "judge") else step_by_step
     guide = None
     if actor is not None and (policy_noise is not None or completed):
-        guide = _Guide(problem, policy_noise, completed, len(actions))
-    roll_out = _at_once if hasattr(model, "judge") else _step_by_step
-    rolled = roll_out(state, actions, problem, guide, gamma, change_cost, last)
-    state, actions, total, over, lost = rolled
+        guide = Guide(problem.bounds, actor, policy_noise, completed)
+    if problem.in_loop and not completed:
+        roll_out = in_a_loop
+    prices = Prices(gamma, change_cost, problem.bounds, last)
+    state, actions, total, over, lost = roll_out(state, actions, model, guide, prices)
     if alpha and problem.value is not None and actor is not None:
-        discount = 1.0
-        for _ in range(len(actions)):  # as the rewards' discounts, which are products
-            discount *= gamma
+        discount = prices.discounts(len(actions) + 1)[-1]
         observation = model.observe(state)
         reduced = torch.autocast(total.device.type, torch.bfloat16)
         with reduced if reduced_tail else nullcontext():
@@ -128,107 +139,3 @@ def score_sequences(
         lost = lost | ~actions.isfinite().all(-1).all(0)
     total = total.masked_fill(lost, float("-inf"))
     return torch.nan_to_num(total, *(float("-inf"),) * 3), actions
-
-
-class _Guide:
-    """Puts the actor's actions in the place of those of the first sequences."""
-
-    def __init__(
-        self, problem: Problem, noise: Tensor | None, completed: int, horizon: int
-    ) -> None:
-        self.problem, self.noise, self.completed, self.last = problem, noise, completed, horizon - 1
-
-    def __call__(self, k: int, state: Any, action: Tensor) -> Tensor:
-        noise = None if self.noise is None else self.noise[k]
-        if self.completed and k == self.last:
-            none = torch.zeros_like(action[: self.completed])
-            noise = none if noise is None else torch.cat([noise, none])
-        if noise is None:
-            return action
-        problem, guided = self.problem, noise.shape[0]
-        assert problem.actor is not None
-        proposal = problem.actor(problem.model.observe(state[:guided])) + noise
-        return torch.cat([problem.bounds.clip(proposal), action[guided:]])
-
-
-def _step_by_step(
-    state: Any,
-    actions: Tensor,
-    problem: Problem,
-    guide: _Guide | None,
-    gamma: float,
-    change_cost: float,
-    last: Tensor | None,
-) -> tuple[Any, Tensor, Tensor, Tensor, Tensor]:
-    """Last states, actions, sums of rewards, and which sequences end and which leave the finite.
-
-    Takes one step after another.
-    """
-    taken = []
-    discount, previous = 1.0, last
-    for k, action in enumerate(actions.unbind(0)):
-        if guide is not None:
-            action = guide(k, state, action)
-            taken.append(action)
-        state, reward, terminated = problem.model.transition(state, action)
-        if change_cost:
-            if previous is not None:
-                reward = reward - _price(action, previous, problem, change_cost)
-            previous = action
-        # States of a stock environment are tensordicts, whose rewards and values alone are judged.
-        finite = state.isfinite().all(-1) if isinstance(state, Tensor) else reward.isfinite()
-        if k == 0:
-            total, over, lost = reward, terminated, ~finite
-        else:
-            lost = lost | ~(finite | over)
-            total = torch.where(over, total, torch.add(total, reward, alpha=discount))
-            over = over | terminated
-        discount *= gamma
-    return state, torch.stack(taken) if taken else actions, total, over, lost
-
-
-def _at_once(
-    state: Tensor,
-    actions: Tensor,
-    problem: Problem,
-    guide: _Guide | None,
-    gamma: float,
-    change_cost: float,
-    last: Tensor | None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]:
-    """The same, with rewards and ends of all steps together, for a model that judges apart."""
-    model: Any = problem.model
-    states, commands, taken = [state], [], []
-    known = model.commands(actions) if guide is None else None
-    for k, action in enumerate(actions.unbind(0)):
-        if guide is not None:
-            action = guide(k, state, action)
-            taken.append(action)
-        command, state = model.advance(state, action, None if known is None else known[k])
-        states.append(state)
-        commands.append(command)
-    actions = torch.stack(taken) if taken else actions
-    path, shape = torch.stack(states), actions.shape[:2]
-    before, after = path[:-1].flatten(0, 1), path[1:].flatten(0, 1)
-    reward, ended = model.judge(before, torch.cat(commands), after)
-    reward = reward.view(shape)
-    if change_cost:
-        earlier = torch.cat([(actions[0] if last is None else last)[None], actions[:-1]])
-        reward = reward - _price(actions, earlier, problem, change_cost)
-    over, bad = None, ~path[1:].isfinite().all(-1)
-    if ended is not None:
-        gone = ended.view(shape).cumsum(0) > 0
-        over = gone[-1]
-        bad = torch.cat([bad[:1], bad[1:] & ~gone[:-1]])
-        reward = torch.cat([reward[:1], reward[1:].masked_fill(gone[:-1], 0.0)])
-    discount, (total, *rewards) = 1.0, reward.unbind(0)
-    for each in rewards:
-        discount *= gamma
-        total = torch.add(total, each, alpha=discount)
-    return state, actions, total, over, bad.any(0)
-
-
-def _price(action: Tensor, previous: Tensor, problem: Problem, change_cost: float) -> Tensor:
-    change = (action - previous) / problem.bounds.scale
-    # Before the first action of an episode there is none, which NaN says.
-    return change_cost * change.square().sum(-1).nan_to_num(0.0)

@@ -45,6 +45,10 @@ from phihp_torchrl.planners.stock_attributes import StockAttributes
 from phihp_torchrl.planners.transformed import find_tensor_model, why_no_tensor_model
 from phihp_torchrl.tasks import ActionBounds
 
+# From so many steps on, the graph of a plan is a loop. On a GPU each turn of a loop would wait for
+# the device, so graphs are written out there.
+_LONG = 10
+
 
 class SamplingPlanner(StockAttributes, MPCPlannerBase):
     """The base of planners that score sampled action sequences in a model.
@@ -223,12 +227,14 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
     def _tensors_compile(self) -> bool:
         return getattr(find_tensor_model(self.env), "compiles", True)
 
-    def problem(self, *, prepared: bool = False) -> Problem:
+    def problem(self, *, prepared: bool = False, compiled: bool = False) -> Problem:
         """Return model, bounds, actor and value as functions.
 
         Args:
             prepared: whether they are for one eager plan, which they make faster, and read the
                 weights as they are now. Results are equal up to rounding.
+            compiled: whether they are for a graph that is compiled, in which the steps of a long
+                plan are a loop.
         """
         shape = self.action_spec.shape
         if self.uses_tensors:
@@ -243,7 +249,12 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
         if self.qvalue is not None:
             keys = (self.value_key, self.action_key)
             value = value_function(self.qvalue, *keys, shape, prepared=prepared)
-        return Problem(model=model, bounds=self.bounds, actor=actor, value=value)
+        if not compiled:
+            return Problem(model=model, bounds=self.bounds, actor=actor, value=value)
+        # Computed here, since an export takes what a planner keeps for a constant of another kind.
+        bounds = ActionBounds.from_limits(self._action_low, self._action_high)
+        long = self.settings.planning_horizon >= _LONG and self._action_low.device.type == "cpu"
+        return Problem(model=model, bounds=bounds, actor=actor, value=value, in_loop=long)
 
     def why_not_compiled(self) -> str | None:
         """Return the reason why the plan cannot be compiled, or ``None``."""
@@ -292,7 +303,8 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
         if not (self._compiles if compiled is None else compiled):
             plan, settings = self._plan, self.settings
             return lambda *args: plan(*args, problem=self.problem(prepared=True), settings=settings)
-        function = partial(self._plan, problem=self.problem(), settings=self.settings)
+        problem = self.problem(compiled=True)
+        function = partial(self._plan, problem=problem, settings=self.settings)
         options = dict(self._compile) if isinstance(self._compile, dict) else {}
         return compile_graph(
             function,

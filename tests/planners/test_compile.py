@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+import pytest
 import torch
 from points import ZEROS, point_problem
 from tensordict import TensorDict
@@ -42,11 +43,12 @@ def test_plans_compile_as_one_graph():
     assert len(graphs) == 1
 
 
-def test_compiled_equals_eager():
+@pytest.mark.parametrize("horizon", [2, 12])  # written out, and as a loop
+def test_compiled_equals_eager(horizon):
     torch._dynamo.reset()
     task, env, actor, qvalue = task_parts("cartpole")
     eager, compiled = (
-        make_planner(env, actor, qvalue, planning_horizon=2, compile=c)
+        make_planner(env, actor, qvalue, planning_horizon=horizon, change_cost=0.1, compile=c)
         for c in (False, {"backend": "eager"})
     )
     for seed in range(2):

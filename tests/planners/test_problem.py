@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf, nan
 
 import pytest
@@ -41,6 +42,35 @@ def test_nothing_counts_after_a_termination():
     state = torch.zeros(3, 1, dtype=torch.float64)
     scores, _ = score_sequences(state, actions.unsqueeze(-1), problem, gamma=0.5, alpha=1.0)
     assert scores.tolist() == [-1.0 + 25.0, -4.0, -1.0 - 0.5 * 4.0]
+
+
+@pytest.mark.parametrize("last", [None, nan, 0.5])
+def test_a_loop_of_a_graph_scores_as_one_step_after_another(last):
+    """Some sequences end, some leave the finite numbers, and some are the actor's."""
+    problem = Problem(
+        model=Point(goal=0.0, wall=3.0),
+        bounds=bounds((-9.0,), (9.0,)),
+        actor=lambda observation: 0.3 - observation,
+        value=lambda observation, action: observation[:, 0] + action[:, 0],
+    )
+    generator = torch.Generator().manual_seed(0)
+    actions = torch.randn(7, 20, 1, dtype=torch.float64, generator=generator)
+    actions[3, 12] = inf
+    state = torch.randn(20, 1, dtype=torch.float64, generator=generator)
+    options = {
+        "policy_noise": torch.randn(7, 5, 1, dtype=torch.float64, generator=generator),
+        "last": None if last is None else torch.full((20, 1), last, dtype=torch.float64),
+    }
+    apart, taken = score_sequences(
+        state, actions, problem, gamma=0.9, alpha=0.5, change_cost=0.1, **options
+    )
+    problem = replace(problem, in_loop=True)
+    scores, acted = torch.compile(score_sequences, backend="eager", fullgraph=True)(
+        state, actions, problem, gamma=0.9, alpha=0.5, change_cost=0.1, **options
+    )
+    assert len(set(apart.isfinite().tolist())) == 2
+    torch.testing.assert_close(scores, apart)
+    torch.testing.assert_close(acted, taken)
 
 
 def test_what_is_not_finite_after_a_termination_does_not_count():
