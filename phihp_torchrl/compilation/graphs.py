@@ -69,8 +69,9 @@ def compile_graph(
 def compile_ahead(module: nn.Module, arguments: tuple[Tensor, ...], path: str | Path) -> None:
     """Compile a call of a module, with its weights, into a package of AOTInductor.
 
-    The weights are constants of the package, which are laid out for its kernels when it is made. The compiler's headers are not precompiled for it: that takes long, and pays only on a machine
-    that makes many packages.
+    The weights are constants of the package, laid out for its kernels when it is made. The
+    compiler's headers are not precompiled for it: that takes long, and pays only on a machine that
+    makes many packages.
 
     Args:
         module: the module.

@@ -47,6 +47,7 @@ from phihp_torchrl.config.errors import ConfigError
 from phihp_torchrl.config.help import help_text, sentences, sentences_of, settings_text
 from phihp_torchrl.config.methods import METHODS, Method, get_method, register_method
 from phihp_torchrl.config.modules import import_named
+from phihp_torchrl.config.own_key import STATE_VARIABLE, is_own_signature, own_signature
 from phihp_torchrl.config.registry import Registry
 from phihp_torchrl.config.seals import (
     DIGEST,

@@ -37,6 +37,7 @@ from phihp_torchrl.deployment.package import (
     check_package,
     describe,
     identify,
+    is_ours,
     use_package,
     write_package,
 )
@@ -74,7 +75,7 @@ def save_agent(
             ``seed``, ``commit``, ``command``, ``samples``, ``config`` and ``returns``. Defaults to
             ``agent.metadata``.
         packaged: whether to compile the plan too, as ``packaged_plan.pt2`` for this platform, which
-            takes a minute; :func:`load_agent` loads it in less than a second if asked.
+            takes half a minute; :func:`load_agent` then loads it in less than a second.
 
     Returns:
         The directory.
@@ -139,9 +140,22 @@ def save_agent(
         if packaged:
             made = Path(temporary, PACKAGE_FILE)
             write_package(agent, made)
-            os.replace(made, directory / PACKAGE_FILE)
-            describe(directory / PACKAGE_FILE, identify(json.loads(text)))
+            place_package(made, directory)
     return directory
+
+
+def place_package(made: Path, directory: Path) -> None:
+    """Put a package of its plan beside a saved agent, with what says whose it is.
+
+    Args:
+        made: the package, as :func:`~phihp_torchrl.deployment.package.write_package` wrote it.
+        directory: the directory of the agent.
+    """
+    place = directory / PACKAGE_FILE
+    coming = directory / f".{PACKAGE_FILE}"
+    shutil.copyfile(made, coming)
+    os.replace(coming, place)
+    describe(place, identify(read_json(directory / AGENT_FILE)))
 
 
 @plain_defaults()
@@ -152,12 +166,12 @@ def load_agent(
     task: str | Task | None = None,
     device: torch.device | str | None = None,
     compile: bool | dict[str, Any] = False,
-    packaged: bool = False,
+    packaged: bool | None = None,
 ) -> Agent:
     """Load a saved agent, ready to act.
 
-    Nothing in the files is executed unless ``packaged`` asks for it, and the sizes of the weights
-    are checked before memory is allocated for them.
+    Nothing in the files is executed but a package that you made yourself on this machine, or that
+    ``packaged`` asks for, and the sizes of the weights are checked before memory is allocated.
 
     Args:
         directory: the directory that :func:`save_agent` wrote.
@@ -168,9 +182,10 @@ def load_agent(
         compile: whether to compile the plan at its first call. Without it the agent plans at once
             and eagerly; see also :meth:`Agent.warm_up`.
         packaged: whether to plan by the native code of ``packaged_plan.pt2`` beside the agent, for
-            one observation at a time on the CPU. A package is a program that runs with your rights,
-            so ask for it only where you trust whoever wrote it. If there is none, or it is of
-            another agent, torch, platform or processor, a warning says so and the agent plans
+            one observation at a time on the CPU. By default that is done where you made the package
+            yourself, on this machine. A package is a program that runs with your rights, so ask for
+            one of others (``True``) only where you trust whoever wrote it. If there is none, or it
+            is of another agent, torch, platform or processor, a warning says so and the agent plans
             eagerly.
 
     Raises:
@@ -232,8 +247,18 @@ def load_agent(
         raise AgentError(f"{path}: expected the key {error}, found none.") from error
     except (ValueError, TypeError, RuntimeError) as error:
         raise AgentError(f"{path}: the agent can not be built: {error}") from error
+    package = directory / PACKAGE_FILE
+    if packaged is None and package.is_file():
+        packaged = agent.planner is not None and device.type == "cpu" and not compile
+        if packaged and not is_ours(package):
+            packaged = False
+            _log.info(
+                "%s was not made by you on this machine and is not opened: it would run with your "
+                "rights. load_agent(..., packaged=True) plans by it.",
+                package,
+            )
     if packaged:
-        _take_package(agent, directory / PACKAGE_FILE, identify(read_json(path)), device)
+        _take_package(agent, package, identify(read_json(path)), device)
     return agent
 
 

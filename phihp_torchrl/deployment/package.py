@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from phihp_torchrl.compilation import compile_ahead
+from phihp_torchrl.config import is_own_signature, own_signature
 from phihp_torchrl.deployment.manifest import platform_name, processor, torch_version
 from phihp_torchrl.deployment.reading import AgentError, read_json
 from phihp_torchrl.origin import package_version
@@ -89,9 +91,22 @@ def use_package(agent: Agent, path: Path) -> None:
 
 
 def describe(path: Path, identity: str) -> None:
-    """Write what the package is for, as JSON beside it."""
+    """Write what the package is for, as JSON beside it, signed by whoever makes it."""
     told = {"format": _FORMAT, "sha256": _digest(path), **_here(identity)}
+    with suppress(OSError):  # no key can be kept here; the package is then loaded where asked for
+        told["signature"] = own_signature(json.dumps(told, sort_keys=True))
     _description(path).write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+
+
+def is_ours(path: Path) -> bool:
+    """Whether a package was made by this user on this machine, and not changed since."""
+    try:
+        told = dict(read_json(_description(path)))
+        signature = told.pop("signature", None)
+        signed = is_own_signature(signature, json.dumps(told, sort_keys=True))
+        return signed and told["sha256"] == _digest(path)
+    except (AgentError, OSError, KeyError):
+        return False
 
 
 def check_package(path: Path, identity: str) -> None:

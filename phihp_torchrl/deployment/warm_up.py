@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from phihp_torchrl.deployment.agent import Agent
 
 _log = logging.getLogger(__name__)
+_MADE = "plan.pt2"
 _CHILD = "import sys; from phihp_torchrl.deployment.warm_up import work; work(*sys.argv[1:])"
 
 
@@ -53,6 +54,13 @@ class WarmUp:
         else:
             planner.compile_plan(agent.example())
             self.compiled = True
+
+    @property
+    def package(self) -> Path | None:
+        """The package that another process has made, if it has been taken."""
+        if self._place is None or not self.compiled:
+            return None
+        return Path(self._place.name, _MADE)
 
     @property
     def ready(self) -> bool:
@@ -91,11 +99,10 @@ class WarmUp:
                         .strip()
                     )
                     raise AgentError((text.splitlines() or ["no reason given"])[-1])
-                use_package(agent, Path(self._place.name, "plan.pt2"))
+                use_package(agent, Path(self._place.name, _MADE))
                 self.compiled = True
             except (AgentError, RuntimeError, OSError) as error:
                 _log.warning("The plan could not be compiled, and stays eager: %s", error)
-        self._place = None  # a package is read whole when it is loaded
         return True
 
     def _start(self, agent: Agent) -> None:
@@ -109,7 +116,7 @@ class WarmUp:
             )
             return
         self._place = tempfile.TemporaryDirectory(prefix="phihp-warm-up-")
-        given, made = (Path(self._place.name, name) for name in ("agent", "plan.pt2"))
+        given, made = (Path(self._place.name, name) for name in ("agent", _MADE))
         given.write_bytes(written)
         words = [sys.executable, "-c", _CHILD, str(given), str(made), str(torch.get_num_threads())]
         paths = os.pathsep.join(path for path in sys.path if path)

@@ -152,8 +152,7 @@ def in_a_loop(
         prices: as for :func:`step_by_step`.
     """
     horizon, rows = actions.shape[:2]
-    like = {"dtype": actions.dtype, "device": actions.device}
-    discounts = torch.tensor(prices.discounts(horizon), **like)
+    discounts = actions.new_tensor(prices.discounts(horizon))
     noise = None if guide is None else guide.noise
     previous = prices.last
     if previous is None:
@@ -187,7 +186,7 @@ def in_a_loop(
     first = (
         torch.zeros((), dtype=torch.int64),
         state.contiguous(),
-        torch.zeros(rows, **like),
+        actions.new_zeros(rows),
         none,
         none.clone(),
         previous.contiguous(),

@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from phihp_torchrl.baselines import check_names
 from phihp_torchrl.config import check_count, check_fields, check_memory, digest_of
 from phihp_torchrl.deployment import Agent, AgentError, load_agent, save_agent
+from phihp_torchrl.deployment.files import place_package
+from phihp_torchrl.deployment.warm_up import WarmUp
 from phihp_torchrl.evaluation import (
     BASELINES_KEY,
     EVALUATION_SEED,
@@ -34,6 +37,9 @@ from phihp_torchrl.worlds import GuardedWorld, World, crossings_text
 
 _log = logging.getLogger(__name__)
 
+# Seconds of training after which a package of the plan, half a minute of another core, is earned.
+_EARNS_PACKAGE = 60.0
+
 
 @dataclass(frozen=True)
 class EvaluateConfig:
@@ -43,6 +49,9 @@ class EvaluateConfig:
         episodes: real episodes, from seeds that no training uses.
         first_seed: seed of these episodes.
         latency_actions: actions whose time is measured, one at a time; 0 for none.
+        packaged: whether the plan is compiled into a package beside the saved agent, with which
+            load_agent plans at once, by another process while the episodes are played; auto on the
+            CPU after a minute of training, where a core is to spare.
         video: whether to write a GIF of an episode (needs the extra rendering).
         baselines: controllers by hand to play beside the agent, built in its model; auto (the quick
             ones that apply, in a simulated world), none, or a list of their names.
@@ -60,6 +69,7 @@ class EvaluateConfig:
     episodes: int = 50
     first_seed: int = EVALUATION_SEED
     latency_actions: int = 200
+    packaged: bool | Literal["auto"] = "auto"
     video: bool = True
     baselines: str | tuple[str, ...] = "auto"
 
@@ -95,6 +105,7 @@ class EvaluatePhase:
         world: the world in which the agent plays; in one of recordings it is saved alone.
         directory: directory of the run, for agent, pictures and ``evaluation.json``.
         samples: real steps that were taken to train the agent.
+        packaged: whether the plan is compiled into a package beside the agent.
     """
 
     def __init__(
@@ -105,6 +116,7 @@ class EvaluatePhase:
         world: World,
         directory: RunDirectory,
         samples: int,
+        packaged: bool = False,
     ) -> None:
         self.agent = agent
         self.config = config
@@ -112,10 +124,12 @@ class EvaluatePhase:
         self.world = world
         self.directory = directory
         self.samples = samples
+        self.packaged = packaged and agent.planner is not None
         self.results: dict[str, dict[str, Any]] = {}
         self.beside: dict[str, dict[str, Any]] = {}
         self.new_files: list[NewFile] = []
         self._played: Episode | None = None
+        self._packaging: WarmUp | None = None
         self._steps: list[tuple[str, Agent]] = []
         if agent.planner is not None and world.has_env:
             self._steps.append(("planner", agent))
@@ -136,8 +150,11 @@ class EvaluatePhase:
     def advance(self) -> dict[str, float]:
         """Evaluate the planner, or else the actor, or else save and show the agent."""
         self.new_files = []
+        if self.packaged and self._packaging is None:
+            self._packaging = self.agent.warm_up(background=True)
         if len(self.results) < len(self._steps):
             return self._evaluate(*self._steps[len(self.results)])
+        metrics = self._take_package()
         self.beside = self._beside()
         self._save()
         if self.world.has_env:
@@ -148,7 +165,7 @@ class EvaluatePhase:
                 self.world,
             )
         self._finished = True
-        return {
+        return metrics | {
             f"evaluate/{name}/{key}": value
             for name, result in self.beside.items()
             for key, value in result.items()
@@ -187,7 +204,7 @@ class EvaluatePhase:
     def _evaluate(self, name: str, agent: Agent) -> dict[str, float]:
         settings, task = self.settings, self.agent.task
         played = evaluate(
-            _eager(agent) if self.world.copies else agent,
+            _eager(agent) if self.world.copies or self._packaging else agent,
             task,
             episodes=settings.episodes,
             seed=settings.first_seed,
@@ -205,11 +222,26 @@ class EvaluatePhase:
                 text,
             )
         summary = played.summary()
-        if settings.latency_actions:
-            summary |= measure_latency(agent, task, calls=settings.latency_actions).summary()
+        if self._packaging is None or agent.planner is None:  # else once it plans as it will later
+            summary |= self._latency(agent)
         self.results[name] = {**summary, "returns": played.returns.tolist()}
         self._played = self._played or played.first
         return {f"evaluate/{name}/{key}": value for key, value in summary.items()}
+
+    def _latency(self, agent: Agent) -> dict[str, float]:
+        if not (calls := self.settings.latency_actions):
+            return {}
+        return measure_latency(agent, self.agent.task, calls=calls).summary()
+
+    def _take_package(self) -> dict[str, float]:
+        """Wait for the package, and measure the time of a plan by it."""
+        if self._packaging is None:
+            return {}
+        packaged = self._packaging.wait()
+        latency = self._latency(self.agent)
+        if "planner" in self.results:  # it has played
+            self.results["planner"] |= {**latency, "packaged": float(packaged)}
+        return {f"evaluate/planner/{key}": value for key, value in latency.items()}
 
     def _beside(self) -> dict[str, dict[str, Any]]:
         """Play the baselines in the same episodes."""
@@ -249,6 +281,8 @@ class EvaluatePhase:
             **self.agent.metadata,
         }
         save_agent(self.agent, self.directory.agent, metadata=metadata)
+        if self._packaging is not None and (package := self._packaging.package) is not None:
+            place_package(package, self.directory.agent)
 
     def _text(self) -> str:
         """The content of ``evaluation.json``."""
@@ -279,6 +313,11 @@ def _eager(agent: Agent) -> Agent:
     return agent.with_planner(agent.planner_config)
 
 
+def _is_core_free(threads: int) -> bool:
+    """Whether this process may use more cores than its threads need."""
+    return len(os.sched_getaffinity(0)) > threads if hasattr(os, "sched_getaffinity") else False
+
+
 def _as_json(value: Any) -> Any:
     """Plain values with null in the place of numbers that are not finite, which JSON lacks."""
     if isinstance(value, Mapping):
@@ -305,7 +344,14 @@ def _build(context: Context) -> Phase:
     guards = collect.exploration.guards if isinstance(collect, CollectConfig) else {}
     if guards and world.truth is None:  # a simulated world is played as a model, which needs none
         world = GuardedWorld(world, guards)
-    return EvaluatePhase(agent, config, context.settings, world, context.directory, samples)
+    packaged = context.settings.packaged
+    if packaged == "auto":
+        spent = sum(context.directory.read_metadata().get("seconds", {}).values())
+        packaged = spent >= _EARNS_PACKAGE and not context.compile and _is_core_free(config.threads)
+        packaged = packaged and next(agent.parameters()).device.type == "cpu"
+    return EvaluatePhase(
+        agent, config, context.settings, world, context.directory, samples, packaged
+    )
 
 
 register_phase("evaluate", EvaluateConfig, _build, unit="parts")

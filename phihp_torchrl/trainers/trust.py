@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
-import hmac
 import json
 import logging
 import os
-import secrets
 import sys
 from collections.abc import Mapping, Sequence
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-import platformdirs
-
-from phihp_torchrl.config import ConfigError, digest_of, digest_of_values
+from phihp_torchrl.config import (
+    ConfigError,
+    digest_of,
+    digest_of_values,
+    is_own_signature,
+    own_signature,
+)
 
 _log = logging.getLogger(__name__)
-
-STATE_VARIABLE = "PHIHP_STATE_DIR"
-"""Environment variable with the folder of the user's key, in the place of the system's own."""
 
 
 def named_code(settings: Mapping[str, Any]) -> dict[str, str]:
@@ -62,7 +60,7 @@ def sign(settings: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     record: dict[str, Any] = {"named": named, "files": _digests(named)}
     try:
-        return {**record, "signature": _signature(record, settings, _key(make=True))}
+        return {**record, "signature": own_signature(_text(record, settings))}
     except OSError as error:
         _log.warning(
             "The code that this run names could not be signed (%s); to resume it, say trust=true.",
@@ -114,11 +112,7 @@ def check_trusted(
 def _changed(settings: Mapping[str, Any], record: Mapping[str, Any]) -> str | None:
     """Why a record is not valid for settings; ``None`` if it is."""
     signed = {key: record.get(key) for key in ("named", "files")}
-    try:
-        ours = _signature(signed, settings, _key(make=False))
-    except OSError:
-        ours = ""
-    if not ours or not hmac.compare_digest(ours, str(record.get("signature"))):
+    if not is_own_signature(record.get("signature"), _text(signed, settings)):
         return "it was not started like this by this user on this machine"
     for name, digest in _digests(named_code(settings)).items():
         if (signed["files"] or {}).get(name) != digest:
@@ -153,34 +147,6 @@ def _file_of(name: str) -> Path | None:
     return Path(spec.origin) if spec is not None and spec.origin else None
 
 
-def _signature(record: Mapping[str, Any], settings: Mapping[str, Any], key: bytes) -> str:
-    world = settings.get("world")
-    text = digest_of_values({"record": record, "world": world})
-    return hmac.new(key, text.encode(), hashlib.sha256).hexdigest()
-
-
-def _key(*, make: bool) -> bytes:
-    """The user's key, which never leaves the user's own folder.
-
-    Raises:
-        OSError: if there is none and none can be made.
-    """
-    root = os.environ.get(STATE_VARIABLE) or platformdirs.user_state_path("phihp_torchrl")
-    path = Path(root).expanduser() / "key"
-    if make and not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        stage = path.with_name(f".key.{secrets.token_hex(8)}")
-        handle = os.open(stage, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(handle, "wb") as file:
-            file.write(secrets.token_bytes(32))
-        try:
-            os.link(stage, path)  # the first of several wins
-        except FileExistsError:
-            pass
-        except OSError:  # a file system without links
-            os.replace(stage, path)
-        finally:
-            stage.unlink(missing_ok=True)
-    if len(key := path.read_bytes()) < 32:
-        raise OSError(f"{path} is no key; remove it")
-    return key
+def _text(record: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
+    """What is signed."""
+    return digest_of_values({"record": record, "world": settings.get("world")})

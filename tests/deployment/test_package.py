@@ -14,6 +14,7 @@ from tensordict import TensorDict
 
 from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, save_agent
 from phihp_torchrl.agents import Actor, TwinQ
+from phihp_torchrl.config import STATE_VARIABLE
 from phihp_torchrl.deployment import AgentError, package
 from phihp_torchrl.planners import CEMConfig
 
@@ -50,9 +51,10 @@ def saved(tmp_path_factory):
         programs["a package"] = program.module()
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(STATE_VARIABLE, str(tmp_path_factory.mktemp("user")))
         patch.setattr(torch._inductor, "aoti_compile_and_package", compile_and_package)
         save_agent(make(), directory, packaged=True)
-    return directory, programs["a package"]
+        yield directory, programs["a package"]
 
 
 @pytest.fixture
@@ -79,7 +81,7 @@ def ours(caplog):
 
 
 def test_a_packaged_plan_is_the_eager_one(directory, caplog):
-    eager, packaged = load_agent(directory), load_agent(directory, packaged=True)
+    eager, packaged = (load_agent(directory, packaged=each) for each in (False, True))
     assert not ours(caplog)
     calls = []
     (used,) = packaged.planner._functions._replaced.values()
@@ -90,12 +92,34 @@ def test_a_packaged_plan_is_the_eager_one(directory, caplog):
     assert calls == [0] * 3
 
 
-def test_nothing_native_is_loaded_unless_asked(directory, monkeypatch):
+def test_the_users_own_package_is_taken(directory, caplog):
+    assert load_agent(directory).planner._functions._replaced
+    assert not load_agent(directory, packaged=False).planner._functions._replaced
+    assert not load_agent(directory, compile=True).planner._functions._replaced
+    assert load_agent(directory, planner=False).planner is None
+    assert not ours(caplog)
+
+
+@pytest.mark.parametrize("change", ["key", "signature", "package"])
+def test_nothing_native_of_others_is_loaded_unless_asked(
+    directory, tmp_path, monkeypatch, caplog, change
+):
     def refuse(path):
         raise AssertionError("native code was loaded")
 
     monkeypatch.setattr(torch._inductor, "aoti_load_package", refuse)
-    assert act(load_agent(directory)).isfinite().all()
+    place = directory / package.PACKAGE_FILE
+    if change == "key":
+        monkeypatch.setenv(STATE_VARIABLE, str(tmp_path / "another"))
+    elif change == "package":
+        place.write_text(place.read_text() + " ")
+    else:
+        told = place.with_name(f"{place.name}.json")
+        content = json.loads(told.read_text())
+        told.write_text(json.dumps({**content, "signature": "0" * 64}))
+    with caplog.at_level(logging.INFO, logger="phihp_torchrl"):
+        assert act(load_agent(directory)).isfinite().all()
+    assert "was not made by you on this machine" in caplog.text
 
 
 def test_a_package_of_another_agent_is_refused(directory, caplog):
@@ -208,4 +232,5 @@ def test_another_process_compiles_the_plan():
     with pytest.raises(TimeoutError, match="still compiling"):
         found.wait(0.01)
     assert found.wait(500)
+    assert found.package.stat().st_size > 0
     torch.testing.assert_close(act(agent), expected, atol=1e-4, rtol=1e-4)

@@ -17,11 +17,11 @@ from safetensors.torch import save
 from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError
 
-from phihp_torchrl.config import ConfigError, compose_yaml, digest_of, sealed
+from phihp_torchrl.config import STATE_VARIABLE, ConfigError, compose_yaml, digest_of, sealed
 from phihp_torchrl.trainers import RunResult, read_request, run
 from phihp_torchrl.trainers.files import check_contained
 from phihp_torchrl.trainers.run_directory import RunDirectory
-from phihp_torchrl.trainers.trust import STATE_VARIABLE, check_trusted, named_code, sign
+from phihp_torchrl.trainers.trust import check_trusted, named_code, sign
 
 from .run_parts import Crash
 from .tally import Tally, TallyConfig, tally_config

@@ -16,7 +16,8 @@ from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError
 
 from phihp_torchrl.config import ConfigError
-from phihp_torchrl.deployment import load_agent
+from phihp_torchrl.deployment import Agent, load_agent
+from phihp_torchrl.deployment.package import PACKAGE_FILE
 from phihp_torchrl.evaluation import Evaluation
 from phihp_torchrl.tasks import get_task
 from phihp_torchrl.trainers import EvaluateConfig, EvaluatePhase, ModelConfig, run
@@ -183,3 +184,40 @@ def test_plans_are_compiled_where_they_are_made_one_at_a_time(
     phase = EvaluatePhase(agent, CONFIG, EvaluateConfig(), world, RunDirectory(whole), 0)
     phase.advance()
     assert compiled == [not copies, True], "returns, and the time of a plan"
+
+
+@pytest.mark.parametrize("compiles", [True, False])
+def test_a_package_of_the_plan_lies_beside_the_agent(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiles: bool
+) -> None:
+    """Another process makes it meanwhile, and the time of a plan is measured with it."""
+    made, order = tmp_path / "made", list[str]()
+    made.write_text("a package")
+
+    def wait() -> bool:
+        order.append("wait")
+        return compiles
+
+    def warm_up(agent: Agent, *, background: bool) -> Any:
+        order.append("begin")
+        return SimpleNamespace(wait=wait, package=made if compiles else None)
+
+    def timed(agent: Agent, *_: Any, **__: Any) -> Any:
+        order.append("actor" if agent.planner is None else "planner")
+        return SimpleNamespace(summary=lambda: {"latency_ms_p50": 1.0})
+
+    monkeypatch.setattr(Agent, "warm_up", warm_up)
+    monkeypatch.setattr(import_module("phihp_torchrl.trainers.evaluate"), "measure_latency", timed)
+    settings = replace(EVALUATE, latency_actions=2, packaged=True)
+    config = with_sections(CONFIG, evaluate=settings)
+    place = tmp_path / "run"
+    assert run(replace(config, phases=("evaluate",), start_from=str(whole)), place).finished
+    assert order == ["begin", "actor", "wait", "planner"]
+    results = json.loads((place / "evaluation.json").read_text())["planner"]
+    assert (results["packaged"], results["latency_ms_p50"]) == (compiles, 1.0)
+    assert (place / "agent" / PACKAGE_FILE).is_file() is compiles
+
+
+def test_a_short_run_earns_no_package(whole: Path) -> None:
+    assert not (whole / "agent" / PACKAGE_FILE).exists()
+    assert "packaged" not in json.loads((whole / "evaluation.json").read_text())["planner"]
