@@ -100,7 +100,10 @@ def _copied(state: Any) -> Any:
 def _returns(trainer: PolicyTrainer) -> dict[str, float]:
     actor = trainer.update.networks.actor
     real = trainer.evaluation.real(actor)["policy/real_return"]
-    return {"imagined": trainer.evaluation.mean(trainer.evaluation.imagined(actor)), "real": real}
+    return {
+        "imagined": trainer.evaluation.mean(trainer.evaluation.imagined(actor).returns),
+        "real": real,
+    }
 
 
 def best(run: dict[str, Any]) -> dict[str, float]:

@@ -145,11 +145,17 @@ class Returns(NamedTuple):
     """Discounted rewards so far, ``[N]``."""
     weight: Tensor
     """Weight of the next reward: gamma^k after k steps, 0 after a termination; ``[N]``."""
+    action: Tensor
+    """Actions of the last step, ``[N, m]``; NaN before the first."""
+    change: Tensor
+    """Changes of the action from step to step so far, in half-ranges, ``[N]``."""
 
     @classmethod
-    def from_state(cls, state: Tensor) -> Returns:
+    def from_state(cls, state: Tensor, bounds: ActionBounds) -> Returns:
         """Make episodes that start in ``state`` ``[N, n]``."""
-        return cls(state, torch.zeros_like(state[..., 0]), torch.ones_like(state[..., 0]))
+        none = torch.zeros_like(state[..., 0])
+        action = torch.full_like(bounds.center.expand(*none.shape, -1), math.nan)
+        return cls(state, none, none + 1.0, action.contiguous(), none.clone())
 
 
 def sum_rewards(
@@ -167,9 +173,12 @@ def sum_rewards(
     References and inputs after each step are ``signals`` ``[steps, N, size]``, or else as the model
     expects them. An episode whose state leaves the finite numbers before it has ended earns NaN.
     """
-    state, total, weight = returns
+    state, total, weight, last, change = returns
     for k in range(steps):
         action = policy(weights, world_model.observe(state), bounds)
+        moved = ((action - last).abs() / bounds.scale).mean(-1)
+        change = torch.where((weight != 0) & moved.isfinite(), change + moved, change)
+        last = action
         state, reward, terminated = world_model.transition(state, action)
         if signals is not None:
             state = world_model.task.with_signals(state, signals[k])
@@ -178,7 +187,7 @@ def sum_rewards(
         lost = ~state.isfinite().all(-1) & (weight != 0)
         total = torch.where(lost, math.nan, total)
         weight = gamma * weight * (1.0 - terminated.to(weight.dtype))
-    return Returns(state, total, weight)
+    return Returns(state, total, weight, last, change)
 
 
 class Rollouts:
@@ -256,7 +265,7 @@ class Rollouts:
         """
         _, eager = self._eager()
         _, piece = self._compiled or (None, eager)
-        returns, size = Returns.from_state(state), self._RETURN_STEPS
+        returns, size = Returns.from_state(state, self.bounds), self._RETURN_STEPS
         whole = steps - steps % size
         for first in range(0, whole, size):
             after = None if signals is None else signals[first : first + size]

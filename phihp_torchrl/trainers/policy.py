@@ -48,8 +48,9 @@ class PolicyTrainer:
     Everything else is the same for all of them.
 
     After every ``evaluation_interval`` updates the noise-free actor is evaluated in the model, from
-    the task's reset box, and the best actor so far is kept with its critics. Returns in a simulated
-    world are only logged; neither they nor seeds of evaluation affect that choice.
+    the task's reset box, and the best actor so far is kept with its critics: the one that earns
+    most, and of several that earn the same, the one whose action changes least. Returns in a
+    simulated world are only logged; neither they nor seeds of evaluation affect that choice.
 
     At the updates that ``config.refit`` sets, the critics of the best actor so far are fitted to
     its returns in the model, unless they were for that actor before, and training continues from
@@ -136,6 +137,7 @@ class PolicyTrainer:
         )
         self.best = [layer.clone() for layer in self._layers()]
         self.best_return = -math.inf
+        self.best_change = self.worst_return = math.inf
         self._is_fitted = False  # the best critics, to the best actor's returns
         self.seconds = 0.0
         self.evaluation = ActorEvaluation(
@@ -190,16 +192,16 @@ class PolicyTrainer:
         config = self.config
         self.start_states.grow(self.updates / config.updates)
         if self.plateau is not None and self.updates == 0:
-            self.plateau.see(0, self.evaluation.imagined(self.update.networks.actor))
+            self.plateau.see(0, self.evaluation.imagined(self.update.networks.actor).returns)
         end = min(self.updates + config.evaluation_interval, self.schedule.end)
         found = self.learner.learn(end)
-        returns = self.evaluation.imagined(self.update.networks.actor)
+        returns, change = self.evaluation.imagined(self.update.networks.actor)
         imagined = self.evaluation.mean(returns)
-        # Of equal ones the later, which has learned more; none that left the finite numbers.
-        if -math.inf < imagined >= self.best_return:
-            self.best_return = imagined
+        if self._is_best(imagined, change):
+            self.best_return, self.best_change = imagined, change
             self._keep(self._layers())
             self._is_fitted = False
+        self.worst_return = min(self.worst_return, imagined)
         unit = self.scales.reward
         metrics = {
             "policy/updates": float(self.updates),
@@ -263,6 +265,8 @@ class PolicyTrainer:
             "scales": vars(self.scales).copy(),
             "best": list(self.best),
             "best_return": self.best_return,
+            "best_change": self.best_change,
+            "worst_return": self.worst_return,
             "is_fitted": self._is_fitted,
             "evaluation_states": self.evaluation.states,
             "world_states": self.evaluation.world_states,
@@ -286,9 +290,22 @@ class PolicyTrainer:
         if self.plateau is not None and "plateau" in state:  # older checkpoints go to their end
             self.plateau.load_state_dict(state["plateau"])
         self.best_return = state["best_return"]
+        self.best_change = state.get("best_change", math.inf)  # older checkpoints do not say
+        self.worst_return = state.get("worst_return", math.inf)
         self._is_fitted = state.get("is_fitted", False)  # older checkpoints fit again
         self.evaluation.states = state["evaluation_states"]
         self.evaluation.world_states = state["world_states"]
+
+    def _is_best(self, imagined: float, change: float) -> bool:
+        """Whether an actor is the one to keep so far; none is that left the finite numbers.
+
+        Of those with equal returns it is the one whose action changes least, where every step
+        earns the same and most actors earn all. Where all earn as little as the first, it is the
+        latest, which has learned more.
+        """
+        if imagined == self.best_return > self.worst_return:
+            return change <= self.best_change
+        return -math.inf < imagined >= self.best_return
 
     def _is_over(self, seconds: float) -> bool:
         """Whether the seconds are spent."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,6 +16,19 @@ from phihp_torchrl.worlds import World
 
 DOING = "playing the actor"
 """What a run says that it is doing while this is on its stack."""
+
+
+class Played(NamedTuple):
+    """What an actor earned.
+
+    Args:
+        returns: its returns ``[N]``, in the units of training; minus infinity where it left the
+            finite numbers.
+        change: mean sum of the changes of its action in an episode, in half-ranges.
+    """
+
+    returns: Tensor
+    change: float
 
 
 class ActorEvaluation:
@@ -57,16 +71,16 @@ class ActorEvaluation:
         )
         self.world_signals = self._draw_signals(task, config.real_evaluation_episodes, seed)
 
-    def imagined(self, actor: Layers) -> Tensor:
-        """Returns in the model ``[N]``; minus infinity where the actor left the finite numbers."""
+    def imagined(self, actor: Layers) -> Played:
+        """What the actor earns in the model."""
         return self._play(self.rollouts, actor, self.states, self.signals)
 
     def real(self, actor: Layers) -> dict[str, float]:
         """Mean return in the simulated world, to log; nothing without one."""
         if self.world is None:
             return {}
-        returns = self._play(self.world, actor, self.world_states, self.world_signals)
-        return {"policy/real_return": self.mean(returns)}
+        played = self._play(self.world, actor, self.world_states, self.world_signals)
+        return {"policy/real_return": self.mean(played.returns)}
 
     def mean(self, returns: Tensor) -> float:
         """Their mean in physical units."""
@@ -82,10 +96,10 @@ class ActorEvaluation:
 
     def _play(
         self, world: Rollouts, actor: Layers, states: Tensor, signals: Tensor | None
-    ) -> Tensor:
+    ) -> Played:
         later = None
         if signals is not None:
             states, later = world.task.with_signals(states, signals[0]), signals[1:]
-        score = world.returns(actor, states, self.steps, signals=later).total
+        _, score, _, _, change = world.returns(actor, states, self.steps, signals=later)
         # Neither NaN nor an infinite return may win.
-        return torch.where(score.isfinite(), score, -math.inf)
+        return Played(torch.where(score.isfinite(), score, -math.inf), change.mean().item())

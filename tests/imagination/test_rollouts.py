@@ -339,7 +339,7 @@ def test_returns_in_chunks_are_the_whole(steps):
     model, actor, bounds = make("cartpole")
     state = model.task.coverage.sample([20])
     values = Rollouts(model, act, 9).returns(actor, state, steps)
-    whole = sum_rewards(model, act, actor, Returns.from_state(state), bounds, steps)
+    whole = sum_rewards(model, act, actor, Returns.from_state(state, bounds), bounds, steps)
     for one, other in zip(values, whole, strict=True):
         assert torch.equal(one, other)
 
@@ -376,10 +376,24 @@ def test_nothing_is_earned_after_the_end():
 def test_rewards_are_discounted_until_the_end(gamma):
     model, actor, bounds = make("cartpole")
     state = torch.tensor([[2.39, 5.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
-    returns = Returns.from_state(state)
+    returns = Returns.from_state(state, bounds)
     for steps in (1, 2):
         returns = sum_rewards(model, act, actor, returns, bounds, steps, gamma)
     assert returns.total.tolist() == pytest.approx([1.0, 1 + gamma + gamma**2])
     assert returns.weight.tolist() == pytest.approx([0.0, gamma**3])
     whole = Rollouts(model, act, 9).returns(actor, state, 3, gamma)
     torch.testing.assert_close(whole, returns)
+
+
+def test_changes_of_the_action_are_summed_until_the_end():
+    model, _, bounds = make("cartpole")
+    state = torch.tensor([[2.39, 5.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]])
+    actions = iter([1.0, -1.0, 0.0, 0.5])
+
+    def policy(weights, observation, bounds):
+        return bounds.from_unit(torch.full((2, 1), next(actions)))
+
+    returns = Returns.from_state(state, bounds)
+    for steps in (1, 3):
+        returns = sum_rewards(model, policy, [], returns, bounds, steps)
+    assert returns.change.tolist() == pytest.approx([0.0, 3.5]), "the first ends at once"

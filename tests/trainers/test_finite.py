@@ -68,7 +68,7 @@ def test_an_actor_that_left_the_finite_numbers_never_wins_in_imagination(name: s
         generator=torch.Generator().manual_seed(0),
         compile=False,
     )
-    assert judge.imagined(weights(name, math.nan)).eq(-math.inf).all()
+    assert judge.imagined(weights(name, math.nan)).returns.eq(-math.inf).all()
 
 
 def test_what_has_ended_may_do_as_it_likes_afterwards() -> None:

@@ -15,6 +15,7 @@ from phihp_torchrl.agents import RefitConfig, act
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.imagination import Rollouts, StartConfig
 from phihp_torchrl.trainers import PolicyTrainer
+from phihp_torchrl.trainers.policy_evaluation import Played
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 from .trainer_parts import (
@@ -91,6 +92,27 @@ def test_the_best_actor_is_kept():
     rollouts = Rollouts(trainer.world_model, act, max_age=5)
     score = rollouts.returns(kept, trainer.evaluation.states[:4], steps=5).total
     assert score.mean().item() == pytest.approx(trainer.best_return)
+
+
+@pytest.mark.parametrize(
+    ("first", "kept"),
+    [(1.0, 1), (5.0, 3)],  # the calmest of those that earn most; the last, where none earns more
+)
+def test_of_equal_actors_the_calmest_is_kept(monkeypatch, first, kept):
+    trainer = policy_trainer(replace(POLICY, updates=16, evaluation_interval=4))
+    played = iter([(first, 0.5), (5.0, 0.1), (5.0, 0.4), (5.0, 0.1 if first > 1 else 0.2)])
+    trainer.plateau = None
+
+    def imagined(actor):
+        earned, change = next(played)
+        return Played(torch.full((2,), earned), change)
+
+    monkeypatch.setattr(trainer.evaluation, "imagined", imagined)
+    actors = []
+    for _ in range(4):
+        trainer.advance()
+        actors.append(trainer.update.actor[0].clone())
+    assert torch.equal(trainer.best[0], actors[kept])
 
 
 def test_kept_actor_and_critics_stand_still():
@@ -225,7 +247,7 @@ def test_critics_are_fitted_once_to_each_best_actor():
     refit = RefitConfig(start=4, interval=4, transitions=32, horizon=3, steps=2, batch_size=16)
     trainer = policy_trainer(replace(POLICY, updates=16, refit=refit))
     returns = iter([1.0, 1.0, 0.0, 2.0])
-    trainer.evaluation.imagined = lambda actor: torch.full((3,), next(returns))
+    trainer.evaluation.imagined = lambda actor: Played(torch.full((3,), next(returns)), 1.0)
     fitted, kept = [], []
     while not trainer.done:
         state = copy.deepcopy(trainer.state_dict())
