@@ -141,8 +141,8 @@ def in_a_loop(
 ) -> RolledOut:
     """The same, as one loop of a graph that is compiled: it holds the step once.
 
-    A plan of 50 steps compiles in a fifth of the time that it takes written out, and is no slower
-    (``benchmarks/speed/long_plans.py``). No sequence is ``completed``.
+    A long plan then compiles in a fraction of the time that it takes written out
+    (``benchmarks/speed/loaded_plans.py`` measures both). No sequence is ``completed``.
 
     Args:
         state: as for :func:`step_by_step`.
