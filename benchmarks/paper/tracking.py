@@ -15,37 +15,25 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from scipy.optimize import minimize
-from tensordict import TensorDict
-from torch import Tensor
 
-from phihp_torchrl import Agent, Task, get_task, learn, load_agent, save_agent
+from phihp_torchrl import Agent, get_task, learn, load_agent, save_agent
 from phihp_torchrl.baselines import LQI
-from phihp_torchrl.evaluation import EVALUATION_SEED, markdown_table
+from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
 from phihp_torchrl.trainers import import_plugins
-from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
+from tracking_episodes import TASKS, measure
+from tuned_controllers import CRITERIA, LQR, TUNABLE, tune
 
 RIGS = Path(__file__).parent / "rigs"
 RESULTS, AGENTS = Path("results/tracking"), Path("outputs/tracking")
-TASKS = ("motor", "motor-preview")
-TUNING_SEED = 0
-STEADY_STEPS = 150
-"""Steps for which a constant reference is held; the last 50 of them count."""
-WORLDS = {
-    "as it is": {},
-    "load of 0.2 Nm": {"friction": {"load": 0.2}},
-    "inertia 1.5 times": {"constants": {"inertia": 0.015}},
-}
 SETTINGS = {
     "model.real_steps": 1000,
     "model.steps_per_iteration": 500,
@@ -69,177 +57,6 @@ SETTLED: dict[str, Any] = {
 """A search that settles: it goes on from its last plan, which it keeps unless another is better.
 
 Chosen by ``tracking_search.py`` with episodes of a training seed."""
-
-LQR = "LQR with integral action"
-
-Policy = Callable[[TensorDict], TensorDict]
-Criterion = Callable[[Tensor, Tensor], float]
-"""What is to be least, of speeds and references ``[steps, episodes]``."""
-
-
-class PI:
-    """u = kp e + ki ∫ e dt, within bounds; the integral stands still where they are reached.
-
-    Args:
-        task: the task, of which it reads speed and reference.
-        kp: gain in V per rad/s.
-        ki: gain of the integral in V per rad.
-    """
-
-    def __init__(self, task: Task, kp: float, ki: float) -> None:
-        self.task, self.kp, self.ki = task, kp, ki
-
-    def __call__(self, tensordict: TensorDict) -> TensorDict:
-        """Act."""
-        state = self.task.locate(tensordict["observation"])
-        reference = self.task.outside.values(self.task.split(state)[1])["reference"]
-        error = reference - state[..., :1]
-        if bool(tensordict["is_init"].all()):
-            self.integral = torch.zeros_like(error)
-        integral = self.integral + self.task.time_step * error
-        wanted = self.kp * error + self.ki * integral
-        action = self.task.clip_action(wanted)
-        outward = (wanted != action) & (wanted * error > 0)
-        self.integral = torch.where(outward, self.integral, integral)
-        return tensordict.set("action", action)
-
-
-def world_of(task: Task, changes: Mapping[str, Any]) -> SimulatedWorld:
-    """The simulated world, with other constants or another load."""
-    return SimulatedWorld(task, SimulatedConfig(**changes))
-
-
-@torch.no_grad()
-def play(
-    policy: Policy,
-    task: Task,
-    changes: Mapping[str, Any],
-    *,
-    episodes: int,
-    seed: int,
-    steps: int | None = None,
-    constant: bool = False,
-) -> tuple[Tensor, Tensor]:
-    """Speeds and references after each step, ``[steps, episodes]``.
-
-    Args:
-        policy: what acts.
-        task: the task.
-        changes: settings of the world.
-        episodes: number of episodes.
-        seed: seed of the first states and of the references.
-        steps: steps of an episode. Defaults to the task's limit.
-        constant: whether the reference stays at its first value.
-    """
-    model = world_of(task, changes).model()
-    assert model is not None
-    generator = torch.Generator().manual_seed(seed)
-    without = get_task(TASKS[0])  # draws alike, whatever the preview
-    state = task.at_rest(without.split(without.sample_start([episodes], generator))[0])
-    drawn = without.outside.draw([episodes], task.max_steps + 1, generator)
-    if constant:
-        drawn = {name: values[:, :1] for name, values in drawn.items()}
-    torch.manual_seed(seed)
-    speeds, references = [], []
-    for step in range(steps or task.max_steps):
-        state = task.with_signals(state, task.outside.window(drawn, step))
-        observed = TensorDict(
-            observation=model.observe(state),
-            is_init=torch.full([episodes, 1], step == 0),
-            batch_size=[episodes],
-        )
-        state = model.transition(state, policy(observed)["action"]).next_state
-        speeds.append(state[:, 0])
-        references.append(task.outside.window(drawn, step + 1)[:, 0])
-    return torch.stack(speeds), torch.stack(references)
-
-
-def rms(speeds: Tensor, references: Tensor) -> float:
-    """Root of the mean squared error over all steps and episodes, in rad/s."""
-    return (speeds - references).square().mean().sqrt().item()
-
-
-def loss(speeds: Tensor, references: Tensor) -> float:
-    """The mean of what the task's reward takes."""
-    speed, reference = speeds.unsqueeze(-1), references.unsqueeze(-1)
-    motor = get_task("motor")
-    return -motor.reward(speed, speed, speed, reference=reference).mean().item()
-
-
-def regulator(task: Task, effort: float, integral_time: float) -> LQI:
-    """The LQR with integral action of the world as it is.
-
-    Args:
-        task: the task.
-        effort: weight of a full action, where the largest of a half-range of the state is 1.
-        integral_time: seconds in which its integral acts.
-    """
-    weights = (effort / task.bounds.scale.square()).tolist()
-    dynamics = world_of(task, {}).oracle()
-    return LQI.from_model(task, dynamics, action_weights=weights, integral_time=integral_time)
-
-
-class Tunable(NamedTuple):
-    """A controller of two positive numbers.
-
-    Args:
-        make: from the task and the numbers to the controller.
-        numbers: what they are called.
-        starts: from where they are sought.
-    """
-
-    make: Callable[[Task, float, float], Policy]
-    numbers: tuple[str, str]
-    starts: tuple[tuple[float, float], ...]
-
-
-TUNABLE = {
-    "PI": Tunable(PI, ("kp", "ki"), ((0.5, 1.0), (2.0, 5.0))),
-    LQR: Tunable(regulator, ("effort", "integral time"), ((0.1, 0.15), (0.01, 0.1))),
-}
-CRITERIA: dict[str, Criterion] = {"least RMS error": rms, "highest return": loss}
-
-
-def tune(
-    kind: Tunable, task: Task, episodes: int, criterion: Criterion, tries: int = 30
-) -> dict[str, float]:
-    """The numbers of a controller that are best by a criterion, in the world as it is.
-
-    Args:
-        kind: the controller.
-        task: the task.
-        episodes: number of episodes.
-        criterion: what is to be least.
-        tries: how often it is played from each start.
-    """
-
-    def cost(logs: Any) -> float:
-        policy = kind.make(task, *(math.exp(x) for x in logs))
-        return criterion(*play(policy, task, {}, episodes=episodes, seed=TUNING_SEED))
-
-    options = {"method": "Nelder-Mead", "options": {"maxfev": tries}}
-    tried = [minimize(cost, [math.log(x) for x in start], **options) for start in kind.starts]
-    best = min(tried, key=lambda found: found.fun)
-    return {name: math.exp(x) for name, x in zip(kind.numbers, best.x, strict=True)}
-
-
-def measure(policy: Policy, task: Task, episodes: int) -> dict[str, dict[str, float]]:
-    """RMS error on random references, and steady errors on constant ones, in each world."""
-    found = {}
-    for name, changes in WORLDS.items():
-        options: dict[str, Any] = {"episodes": episodes, "seed": EVALUATION_SEED}
-        moving = play(policy, task, changes, **options)
-        speeds, references = play(
-            policy, task, changes, steps=STEADY_STEPS, constant=True, **options
-        )
-        last = (speeds - references)[-50:]
-        found[name] = {
-            "rms": rms(*moving),
-            "steady_error": last.mean(0).abs().mean().item(),
-            "steady_error_largest": last.mean(0).abs().max().item(),
-            "steady_ripple": last.std(0).mean().item(),
-        }
-    return found
 
 
 def train(name: str, seed: int, updates: int, place: Path, models: Path | None = None) -> Agent:

@@ -25,7 +25,9 @@ from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.trainers import import_plugins
 from phihp_torchrl.worlds import SimulatedWorld
-from tracking import PI, RIGS, play, rms
+from tracking import RIGS
+from tracking_episodes import play, rms
+from tuned_controllers import PI
 
 RESULTS, TUNED = Path("results/tracking_search"), Path("results/tracking/motor.json")
 SEED, STEPS = 1, 75

@@ -10,7 +10,7 @@ from phihp_torchrl.deployment.defaults import plain_defaults
 from phihp_torchrl.deployment.export import export_aoti, export_onnx, largest_differences
 from phihp_torchrl.deployment.export_modules import ActorModule, PlanModule
 from phihp_torchrl.deployment.exported import ExportedAgent, load_exported
-from phihp_torchrl.deployment.files import load_agent, save_agent
+from phihp_torchrl.deployment.files import load_agent, place_package, save_agent
 from phihp_torchrl.deployment.formats import TaskSignature
 from phihp_torchrl.deployment.kinds import AGENT_KINDS, register_agent
 from phihp_torchrl.deployment.observer import VelocityObserver
@@ -18,6 +18,7 @@ from phihp_torchrl.deployment.reading import AgentError
 from phihp_torchrl.deployment.realtime import RealTimeReport, run_realtime
 from phihp_torchrl.deployment.safety import Safety
 from phihp_torchrl.deployment.socket_plant import simulated_plant
+from phihp_torchrl.deployment.warm_up import WarmUp
 
 __all__ = [
     "Agent",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,14 @@ from typing import Any, Literal, NamedTuple
 
 from phihp_torchrl.baselines import check_names
 from phihp_torchrl.config import check_count, check_fields, check_memory, digest_of
-from phihp_torchrl.deployment import Agent, AgentError, load_agent, save_agent
-from phihp_torchrl.deployment.files import place_package
-from phihp_torchrl.deployment.warm_up import WarmUp
+from phihp_torchrl.deployment import (
+    Agent,
+    AgentError,
+    WarmUp,
+    load_agent,
+    place_package,
+    save_agent,
+)
 from phihp_torchrl.evaluation import (
     BASELINES_KEY,
     EVALUATION_SEED,
@@ -29,6 +33,7 @@ from phihp_torchrl.evaluation import (
 from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.files import write_atomically
+from phihp_torchrl.trainers.packaging import earns_package
 from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
 from phihp_torchrl.trainers.return_curve import read_rows, return_curve
 from phihp_torchrl.trainers.run_config import RunConfig
@@ -36,9 +41,6 @@ from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.worlds import GuardedWorld, World, crossings_text
 
 _log = logging.getLogger(__name__)
-
-# Seconds of training after which a package of the plan, half a minute of another core, is earned.
-_EARNS_PACKAGE = 60.0
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ class EvaluatePhase:
         self.world = world
         self.directory = directory
         self.samples = samples
-        self.packaged = packaged and agent.planner is not None
+        self.packaged = packaged
         self.results: dict[str, dict[str, Any]] = {}
         self.beside: dict[str, dict[str, Any]] = {}
         self.new_files: list[NewFile] = []
@@ -313,11 +315,6 @@ def _eager(agent: Agent) -> Agent:
     return agent.with_planner(agent.planner_config)
 
 
-def _is_core_free(threads: int) -> bool:
-    """Whether this process may use more cores than its threads need."""
-    return len(os.sched_getaffinity(0)) > threads if hasattr(os, "sched_getaffinity") else False
-
-
 def _as_json(value: Any) -> Any:
     """Plain values with null in the place of numbers that are not finite, which JSON lacks."""
     if isinstance(value, Mapping):
@@ -344,11 +341,7 @@ def _build(context: Context) -> Phase:
     guards = collect.exploration.guards if isinstance(collect, CollectConfig) else {}
     if guards and world.truth is None:  # a simulated world is played as a model, which needs none
         world = GuardedWorld(world, guards)
-    packaged = context.settings.packaged
-    if packaged == "auto":
-        spent = sum(context.directory.read_metadata().get("seconds", {}).values())
-        packaged = spent >= _EARNS_PACKAGE and not context.compile and _is_core_free(config.threads)
-        packaged = packaged and next(agent.parameters()).device.type == "cpu"
+    packaged = earns_package(context, agent)
     return EvaluatePhase(
         agent, config, context.settings, world, context.directory, samples, packaged
     )

@@ -7,6 +7,8 @@ import json
 import pytest
 
 import tracking
+import tracking_episodes
+import tuned_controllers
 from phihp_torchrl import Agent, HybridDynamics, get_task
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.baselines import LQI
@@ -22,9 +24,9 @@ def rig():
 def test_an_lqr_in_the_prior_keeps_its_speed_in_every_world() -> None:
     task = get_task("motor-preview")
     lqi = LQI.from_model(task, HybridDynamics.pure_prior(task))
-    for changes in tracking.WORLDS.values():
+    for changes in tracking_episodes.WORLDS.values():
         options = {"episodes": 4, "seed": 0, "steps": 150, "constant": True}
-        speeds, references = tracking.play(lqi, task, changes, **options)
+        speeds, references = tracking_episodes.play(lqi, task, changes, **options)
         assert (speeds - references)[-25:].abs().max() < 0.05
 
 
@@ -40,12 +42,13 @@ def test_all_are_measured_in_the_same_worlds(tmp_path, monkeypatch) -> None:
         metadata={"seconds": 1.0},
     )
     monkeypatch.setattr(tracking, "train", lambda *arguments: agent)
-    play = tracking.play
+    play = tracking_episodes.play
 
     def short(*arguments, steps=None, **options):
         return play(*arguments, steps=12, **options)
 
-    monkeypatch.setattr(tracking, "play", short)
+    for module in (tracking_episodes, tuned_controllers):
+        monkeypatch.setattr(module, "play", short)
     words = ["--tasks", "motor", "--episodes", "2", "--tries", "1", "--results", f"{tmp_path}"]
     tracking.main(words)
     tuned, beside = (json.loads((tmp_path / f"{name}.json").read_text())
@@ -60,7 +63,7 @@ def test_all_are_measured_in_the_same_worlds(tmp_path, monkeypatch) -> None:
         for name in ("planner", "planner that settles", "actor", "LQR with integral action")
     ]
     for found in (*tuned["measured"].values(), *beside["measured"].values()):
-        assert found.keys() == tracking.WORLDS.keys()
+        assert found.keys() == tracking_episodes.WORLDS.keys()
     page = (tmp_path / "README.md").read_text()
     assert "effort = 0.1" in page or "effort = 0.01" in page
     assert "| motor | LQR with integral action, seed 100 | load of 0.2 Nm |" in page
