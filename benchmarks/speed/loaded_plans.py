@@ -38,10 +38,10 @@ ROUNDS, EPISODES = 200, 50
 
 def packaged(agent: Any, *, looped: bool = True) -> tuple[Any, float]:
     """The agent as load_agent gives it after it was saved with a package, and the seconds of it."""
-    longest = sampling_planner._LONG if looped else math.inf
+    longest = sampling_planner.LONG_PLAN if looped else math.inf
     with (
         tempfile.TemporaryDirectory() as place,
-        mock.patch.object(sampling_planner, "_LONG", longest),
+        mock.patch.object(sampling_planner, "LONG_PLAN", longest),
     ):
         start = time.perf_counter()
         save_agent(agent, place, packaged=True)

@@ -45,9 +45,10 @@ from phihp_torchrl.planners.stock_attributes import StockAttributes
 from phihp_torchrl.planners.transformed import find_tensor_model, why_no_tensor_model
 from phihp_torchrl.tasks import ActionBounds
 
-# From so many steps on, the graph of a plan is a loop. On a GPU each turn of a loop would wait for
-# the device, so graphs are written out there.
-_LONG = 10
+LONG_PLAN = 10
+"""Steps from which on the graph of a plan is a loop.
+
+On a GPU each turn of a loop would wait for the device, so graphs are written out there."""
 
 
 class SamplingPlanner(StockAttributes, MPCPlannerBase):
@@ -253,7 +254,7 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
             return Problem(model=model, bounds=self.bounds, actor=actor, value=value)
         # Computed here, since an export takes what a planner keeps for a constant of another kind.
         bounds = ActionBounds.from_limits(self._action_low, self._action_high)
-        long = self.settings.planning_horizon >= _LONG and self._action_low.device.type == "cpu"
+        long = self.settings.planning_horizon >= LONG_PLAN and self._action_low.device.type == "cpu"
         return Problem(model=model, bounds=bounds, actor=actor, value=value, in_loop=long)
 
     def why_not_compiled(self) -> str | None:

@@ -16,6 +16,7 @@ from typing import Any
 from phihp_torchrl.config import resolve_seconds
 from phihp_torchrl.display import duration
 from phihp_torchrl.evaluation import AT_ONCE
+from phihp_torchrl.planners import LONG_PLAN
 from phihp_torchrl.trainers.planned_acts import PLANS_END, SEARCH
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.worlds import World
@@ -31,6 +32,8 @@ _RETURN_SECONDS = 5 * _STEP_SECONDS  # the steps of a compiled piece of a return
 # A step of a model alone, for as many rows as a plan has: what it takes does not grow with its
 # operations as what it saves does, for a call of a graph has its own price.
 _ALONE = _RATES["step"]
+# A long plan is a loop in its graph for each iteration, which compiles as long as so many steps.
+_LOOP_STEPS = 4
 # Lots of episodes that calibration lets plans play: of three ways, of the chosen one, fast ones.
 _WAYS = 5
 # Learning that may end at a plateau is taken to have this share of its updates.
@@ -209,7 +212,9 @@ def _evaluate(config: RunConfig, settings: Any, world: World) -> Earned:
         return Earned(0.0, 0.0)
     plans = settings.episodes * world.task.max_steps + settings.latency_actions
     steps = _plan_steps(config)
-    return Earned(plans * steps * _STEP / 1e3, steps * _STEP_SECONDS)
+    looped = config.planner.planning_horizon >= LONG_PLAN
+    compiled = _LOOP_STEPS * config.planner.optim_steps if looped else steps
+    return Earned(plans * steps * _STEP / 1e3, compiled * _STEP_SECONDS)
 
 
 _PHASES: dict[str, Callable[[RunConfig, Any, World], Earned]] = {
