@@ -17,7 +17,7 @@ from phihp_torchrl.commands import use_utf8
 from phihp_torchrl.display import loading
 
 TASK = "pendulum-swingup"
-FEWER = ("evaluate.episodes=20",)
+FEWER = ("evaluate.episodes=20", "evaluate.packaged=false")
 OUTPUT = Path("outputs/demo")
 FIRST = (
     f"{TASK}: from nothing, it takes real steps, fits a model to them, learns a policy in the "
