@@ -121,7 +121,7 @@ def description(agent: Agent, name: str, seed: int, episodes: int) -> dict[str, 
 
 def sweep(task: str, episodes: int, calls: int, before: dict[str, Any]) -> dict[str, Any]:
     """Returns and latency of every budget on a task; what was played before stays."""
-    agent = load_agent(AGENTS / task)
+    agent = load_agent(AGENTS / task, packaged=False)
     compiled = {name: build(agent, name, compile=True) for name in BUDGETS}
     milliseconds = latencies(compiled, agent, calls)
     rows: dict[str, Any] = {}
@@ -158,7 +158,7 @@ def choose(tasks: dict[str, dict]) -> str:
 
 def report(task: str, chosen: str, calls: int, before: dict[str, Any]) -> dict[str, Any]:
     """The choice against the published budget, on evaluation seeds; both played once, ever."""
-    agent = load_agent(AGENTS / task)
+    agent = load_agent(AGENTS / task, packaged=False)
     fast = build(agent, chosen, compile=True)
     planners = {"published, eager": build(agent, PUBLISHED), "chosen, compiled": fast}
     milliseconds = latencies(planners, agent, calls)

@@ -45,7 +45,11 @@ def packaged(agent: Any, *, looped: bool = True) -> tuple[Any, float]:
     ):
         start = time.perf_counter()
         save_agent(agent, place, packaged=True)
-        return load_agent(place), time.perf_counter() - start
+        seconds = time.perf_counter() - start
+        loaded = load_agent(place)
+        if not loaded.planner._functions._replaced:
+            raise RuntimeError("load_agent did not take the package; what it logged says why.")
+        return loaded, seconds
 
 
 def measure(task: str, place: Path, *, written_out: bool) -> dict[str, Any] | None:

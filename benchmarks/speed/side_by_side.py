@@ -282,7 +282,7 @@ def growth_part(compiled: bool) -> dict[str, Any]:
 
 _MEMORY = {
     "torch and this package imported": "",
-    "and an agent that plans eagerly": "act(load_agent(AGENT))",
+    "and an agent that plans eagerly": "act(load_agent(AGENT, packaged=False))",
     "and one that is compiled": "act(load_agent(AGENT, compile=True))",
 }
 

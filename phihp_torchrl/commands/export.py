@@ -89,7 +89,7 @@ def export(config: ExportConfig) -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     try:
-        agent = load_agent(config.agent)
+        agent = load_agent(config.agent, packaged=False)
     except AgentError as error:
         raise ConfigError("agent", str(error)) from error
     parts = [part for part in config.parts if part == "actor" or agent.planner is not None]

@@ -36,11 +36,13 @@ def is_own_signature(signature: object, text: str) -> bool:
         signature: what is said to be :func:`own_signature` of the text.
         text: the text.
     """
+    if not isinstance(signature, str) or not signature.isascii():
+        return False
     try:
         ours = _signature(text, _key(make=False))
     except OSError:
         return False
-    return hmac.compare_digest(ours.encode(), str(signature).encode())
+    return hmac.compare_digest(ours, signature)
 
 
 def _signature(text: str, key: bytes) -> str:

@@ -14,6 +14,7 @@ from phihp_torchrl.deployment.files import load_agent, place_package, save_agent
 from phihp_torchrl.deployment.formats import TaskSignature
 from phihp_torchrl.deployment.kinds import AGENT_KINDS, register_agent
 from phihp_torchrl.deployment.observer import VelocityObserver
+from phihp_torchrl.deployment.package import PACKAGE_FILE
 from phihp_torchrl.deployment.reading import AgentError
 from phihp_torchrl.deployment.realtime import RealTimeReport, run_realtime
 from phihp_torchrl.deployment.safety import Safety

@@ -34,9 +34,11 @@ from phihp_torchrl.deployment.formats import (
 from phihp_torchrl.deployment.kinds import find_kind
 from phihp_torchrl.deployment.package import (
     PACKAGE_FILE,
+    PACKAGE_NOTE,
     check_package,
     describe,
     identify,
+    is_of,
     is_ours,
     use_package,
     write_package,
@@ -137,6 +139,7 @@ def save_agent(
         os.replace(Path(temporary, WEIGHTS_FILE), directory / NEXT_WEIGHTS_FILE)
         os.replace(Path(temporary, AGENT_FILE), directory / AGENT_FILE)
         os.replace(directory / NEXT_WEIGHTS_FILE, directory / WEIGHTS_FILE)
+        _drop_package_of_another(directory)
         if packaged:
             made = Path(temporary, PACKAGE_FILE)
             write_package(agent, made)
@@ -151,11 +154,21 @@ def place_package(made: Path, directory: Path) -> None:
         made: the package, as :func:`~phihp_torchrl.deployment.package.write_package` wrote it.
         directory: the directory of the agent.
     """
-    place = directory / PACKAGE_FILE
-    coming = directory / f".{PACKAGE_FILE}"
-    shutil.copyfile(made, coming)
-    os.replace(coming, place)
-    describe(place, identify(read_json(directory / AGENT_FILE)))
+    text = describe(made, identify(read_json(directory / AGENT_FILE)))
+    with tempfile.TemporaryDirectory(dir=directory, prefix=_SAVING) as temporary:
+        shutil.copyfile(made, Path(temporary, PACKAGE_FILE))
+        Path(temporary, PACKAGE_NOTE).write_text(text, encoding="utf-8")
+        for name in (PACKAGE_FILE, PACKAGE_NOTE):
+            os.replace(Path(temporary, name), directory / name)
+
+
+def _drop_package_of_another(directory: Path) -> None:
+    """Remove a package of the agent that was here before, which nobody can plan by any more."""
+    if (directory / PACKAGE_FILE).exists() and not is_of(
+        directory / PACKAGE_NOTE, identify(read_json(directory / AGENT_FILE))
+    ):
+        for name in (PACKAGE_FILE, PACKAGE_NOTE):
+            (directory / name).unlink(missing_ok=True)
 
 
 @plain_defaults()
@@ -184,9 +197,9 @@ def load_agent(
         packaged: whether to plan by the native code of ``packaged_plan.pt2`` beside the agent, for
             one observation at a time on the CPU. By default that is done where you made the package
             yourself, on this machine. A package is a program that runs with your rights, so ask for
-            one of others (``True``) only where you trust whoever wrote it. If there is none, or it
-            is of another agent, torch, platform or processor, a warning says so and the agent plans
-            eagerly.
+            one of others (``True``) only where you trust whoever wrote it. If it is of another
+            agent, torch, platform or processor, or there is none that you asked for, a warning says
+            so and the agent plans eagerly. So it does after its weights have changed.
 
     Raises:
         AgentError: if both ``compile`` and ``packaged`` are asked for, or a file is missing,
@@ -247,30 +260,37 @@ def load_agent(
         raise AgentError(f"{path}: expected the key {error}, found none.") from error
     except (ValueError, TypeError, RuntimeError) as error:
         raise AgentError(f"{path}: the agent can not be built: {error}") from error
-    package = directory / PACKAGE_FILE
-    if packaged is None and package.is_file():
-        packaged = agent.planner is not None and device.type == "cpu" and not compile
-        if packaged and not is_ours(package):
-            packaged = False
-            _log.info(
-                "%s was not made by you on this machine and is not opened: it would run with your "
-                "rights. load_agent(..., packaged=True) plans by it.",
-                package,
-            )
-    if packaged:
-        _take_package(agent, package, identify(read_json(path)), device)
+    there = (directory / PACKAGE_FILE).is_file()
+    fits = there and agent.planner is not None and device.type == "cpu" and not compile
+    if packaged or (packaged is None and fits):
+        _take_package(agent, directory, device, trusted=bool(packaged))
     return agent
 
 
-def _take_package(agent: Agent, path: Path, identity: str, device: torch.device) -> None:
+def _take_package(agent: Agent, directory: Path, device: torch.device, *, trusted: bool) -> None:
+    """Plan by a package, if it is what it should be and the user's own or trusted."""
+    identity = identify(read_json(directory / AGENT_FILE))
     try:
         if agent.planner is None:
             raise AgentError("packaged: expected an agent that plans, got one without a planner.")
         if device.type != "cpu":
             raise AgentError(f"packaged: expected the CPU, for which it is made, got {device}.")
-        check_package(path, identity)
-        use_package(agent, path)
-    except (AgentError, RuntimeError) as error:
+        with tempfile.TemporaryDirectory(prefix="phihp-package-") as private:
+            # What is checked is what is opened, whoever else may write into the directory.
+            for name in (PACKAGE_FILE, PACKAGE_NOTE):
+                with suppress(FileNotFoundError):
+                    shutil.copyfile(directory / name, Path(private, name))
+            package = Path(private, PACKAGE_FILE)
+            if not trusted and not is_ours(package):
+                _log.info(
+                    "%s was not made by you on this machine and is not opened: it would run with "
+                    "your rights. load_agent(..., packaged=True) plans by it.",
+                    directory / PACKAGE_FILE,
+                )
+                return
+            check_package(package, identity)
+            use_package(agent, package)
+    except (AgentError, RuntimeError, OSError) as error:
         _log.warning("The agent plans eagerly: %s", error)
 
 

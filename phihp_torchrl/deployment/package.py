@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from phihp_torchrl.compilation import compile_ahead
-from phihp_torchrl.config import is_own_signature, own_signature
+from phihp_torchrl.config import DIGEST, is_own_signature, own_signature
 from phihp_torchrl.deployment.manifest import platform_name, processor, torch_version
 from phihp_torchrl.deployment.reading import AgentError, read_json
 from phihp_torchrl.origin import package_version
@@ -23,7 +23,10 @@ from phihp_torchrl.planners import SamplingPlanner
 if TYPE_CHECKING:
     from phihp_torchrl.deployment.agent import Agent
 
+_log = logging.getLogger(__name__)
+
 PACKAGE_FILE = "packaged_plan.pt2"
+PACKAGE_NOTE = f"{PACKAGE_FILE}.json"
 _FORMAT = "phihp_torchrl packaged plan"
 # Largest relative difference of scores from the eager plan's, for the same noise.
 _TOLERANCE = 0.01
@@ -67,6 +70,8 @@ def write_package(agent: Agent, path: Path) -> None:
 def use_package(agent: Agent, path: Path) -> None:
     """Plan by a package from now on, after it has found what the eager plan finds.
 
+    When weights change, in place or by ``load_state_dict``, the agent plans eagerly again.
+
     Raises:
         AgentError: if it finds another plan.
     """
@@ -75,8 +80,12 @@ def use_package(agent: Agent, path: Path) -> None:
     arguments, eager = planner.example_call(agent.example())
     loaded = torch._inductor.aoti_load_package(str(path))
     _, spec = pytree.tree_flatten(eager)
+    weights = [*planner.parameters(), *planner.buffers()]
+    known = [tensor._version for tensor in weights]
 
     def plan(*args: Any) -> Any:
+        if [tensor._version for tensor in weights] != known:
+            return planner.plan_eagerly(*args)
         return pytree.tree_unflatten(list(loaded(*_tensors(args))), spec)
 
     with torch.no_grad():
@@ -90,12 +99,26 @@ def use_package(agent: Agent, path: Path) -> None:
     planner.replace_plan(arguments, plan)
 
 
-def describe(path: Path, identity: str) -> None:
-    """Write what the package is for, as JSON beside it, signed by whoever makes it."""
-    told = {"format": _FORMAT, "sha256": _digest(path), **_here(identity)}
-    with suppress(OSError):  # no key can be kept here; the package is then loaded where asked for
-        told["signature"] = own_signature(json.dumps(told, sort_keys=True))
-    _description(path).write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
+def describe(made: Path, identity: str) -> str:
+    """What a package is for, as JSON to lie beside it, signed by whoever makes it."""
+    told = {"format": _FORMAT, "sha256": _digest(made), **_here(identity)}
+    try:
+        told["signature"] = own_signature(_signed(told))
+    except OSError as error:
+        _log.warning(
+            "The packaged plan could not be signed (%s), so that load_agent opens it with "
+            "packaged=True alone.",
+            error,
+        )
+    return json.dumps(told, indent=2) + "\n"
+
+
+def is_of(note: Path, identity: str) -> bool:
+    """Whether what lies beside a package says that it is of this agent."""
+    try:
+        return read_json(note).get("agent_sha256") == identity
+    except AgentError:
+        return False
 
 
 def is_ours(path: Path) -> bool:
@@ -103,8 +126,7 @@ def is_ours(path: Path) -> bool:
     try:
         told = dict(read_json(_description(path)))
         signature = told.pop("signature", None)
-        signed = is_own_signature(signature, json.dumps(told, sort_keys=True))
-        return signed and told["sha256"] == _digest(path)
+        return is_own_signature(signature, _signed(told)) and told["sha256"] == _digest(path)
     except (AgentError, OSError, KeyError):
         return False
 
@@ -132,7 +154,7 @@ def check_package(path: Path, identity: str) -> None:
 
 def identify(content: Mapping[str, Any]) -> str:
     """A digest of all of an agent's file that a plan depends on, its weights' among it."""
-    plain = {key: value for key, value in content.items() if key != "metadata"}
+    plain = {key: value for key, value in content.items() if key not in ("metadata", DIGEST)}
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
@@ -144,6 +166,11 @@ def _here(identity: str) -> dict[str, Any]:
         "platform": platform_name(),
         "processor": list(processor()),
     }
+
+
+def _signed(told: Mapping[str, Any]) -> str:
+    """The text that is signed; its first word keeps it apart from what else the key signs."""
+    return "package " + json.dumps(told, sort_keys=True)
 
 
 def _digest(path: Path) -> str:

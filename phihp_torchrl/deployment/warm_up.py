@@ -103,11 +103,19 @@ class WarmUp:
                 self.compiled = True
             except (AgentError, RuntimeError, OSError) as error:
                 _log.warning("The plan could not be compiled, and stays eager: %s", error)
+        if not self.compiled:
+            self._place = None
         return True
 
     def _start(self, agent: Agent) -> None:
         try:
             written = pickle.dumps(agent)
+            self._place = tempfile.TemporaryDirectory(prefix="phihp-warm-up-")
+            given, made = (Path(self._place.name, name) for name in ("agent", _MADE))
+            given.write_bytes(written)
+        except OSError as error:
+            _log.warning("The plan stays eager: %s", error)
+            return
         except (pickle.PicklingError, AttributeError, TypeError) as error:
             _log.warning(
                 "The plan stays eager, because another process cannot be given the agent: %s. "
@@ -115,9 +123,6 @@ class WarmUp:
                 error,
             )
             return
-        self._place = tempfile.TemporaryDirectory(prefix="phihp-warm-up-")
-        given, made = (Path(self._place.name, name) for name in ("agent", _MADE))
-        given.write_bytes(written)
         words = [sys.executable, "-c", _CHILD, str(given), str(made), str(torch.get_num_threads())]
         paths = os.pathsep.join(path for path in sys.path if path)
         with open(Path(self._place.name, "log"), "wb") as log:
@@ -150,3 +155,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     """Stop a compiler whose result nobody waits for any more."""
     if process.poll() is None:
         process.terminate()
+        try:
+            process.wait(5.0)  # it may be writing
+        except subprocess.TimeoutExpired:
+            process.kill()

@@ -123,7 +123,7 @@ def score_sequences(
     guide = None
     if actor is not None and (policy_noise is not None or completed):
         guide = Guide(problem.bounds, actor, policy_noise, completed)
-    if problem.in_loop and not completed:
+    if problem.in_loop:
         roll_out = in_a_loop
     prices = Prices(gamma, change_cost, problem.bounds, last)
     state, actions, total, over, lost = roll_out(state, actions, model, guide, prices)

@@ -142,7 +142,7 @@ def in_a_loop(
     """The same, as one loop of a graph that is compiled: it holds the step once.
 
     A long plan then compiles in a fraction of the time that it takes written out
-    (``benchmarks/speed/loaded_plans.py`` measures both). No sequence is ``completed``.
+    (``benchmarks/speed/loaded_plans.py`` measures both).
 
     Args:
         state: as for :func:`step_by_step`.
@@ -153,7 +153,7 @@ def in_a_loop(
     """
     horizon, rows = actions.shape[:2]
     discounts = actions.new_tensor(prices.discounts(horizon))
-    noise = None if guide is None else guide.noise
+    act = None if guide is None else _guided_step(guide, actions)
     previous = prices.last
     if previous is None:
         previous = torch.full_like(actions[0], torch.nan)
@@ -172,13 +172,16 @@ def in_a_loop(
     ) -> tuple[Tensor, ...]:
         place = k.unsqueeze(0)
         action = actions.index_select(0, place)[0]
-        if guide is not None and noise is not None:
-            action = guide(model, state, action, noise.index_select(0, place)[0])
-        state, reward, terminated = model.transition(state, action)
+        if act is not None:
+            action = act(model, state, action, place)
+        moved, reward, terminated = model.transition(state, action)
+        # What a turn of a loop gives must be new and lie as what it was given.
+        state = moved.to(state.dtype, copy=True, memory_format=torch.contiguous_format)
         if prices.change_cost:
             reward = reward - prices.of(action, previous)
         lost = lost | ~(state.isfinite().all(-1) | over)
-        total = torch.where(over, total, total + discounts.index_select(0, place) * reward)
+        earned = (discounts.index_select(0, place) * reward).to(total.dtype)
+        total = torch.where(over, total, total + earned)
         taken = taken.index_copy(0, place, action.unsqueeze(0))
         return k + 1, state, total, over | terminated, lost, action.clone(), taken
 
@@ -194,6 +197,24 @@ def in_a_loop(
     )
     _, state, total, over, lost, _, taken = while_loop(goes_on, step, first)
     return RolledOut(state, taken, total, over, lost)
+
+
+def _guided_step(guide: Guide, actions: Tensor) -> Callable[..., Tensor]:
+    """The guide as a function of a step's place, for sequences ``[H, rows, m]`` in a loop."""
+    horizon, completed = len(actions), guide.completed
+    none = torch.zeros_like(actions[:, :completed])
+    noise = none if guide.noise is None else torch.cat([guide.noise, none], 1)
+    first, last = noise.shape[1] - completed, noise.shape[1]
+
+    def act(model: TensorModel, state: Tensor, action: Tensor, place: Tensor) -> Tensor:
+        acted = guide(model, state, action, noise.index_select(0, place)[0])
+        if not completed:
+            return acted
+        at_end = (place == horizon - 1).to(action.device)
+        own = torch.where(at_end, acted[first:last], action[first:last])
+        return torch.cat([acted[:first], own, acted[last:]])
+
+    return act
 
 
 def at_once(

@@ -291,6 +291,10 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
         """Plan by another function where the arguments have the shapes of ``args``."""
         self._functions.replace(function, *args)
 
+    def plan_eagerly(self, *args: Any) -> Any:
+        """Call the plan's function for these arguments, neither compiled nor replaced."""
+        return self._build(compiled=False)(*args)
+
     def compile_plan(self, tensordict: TensorDictBase) -> None:
         """Compile the plan for observations of this batch size, and plan by that from now on."""
         args, _ = self.example_call(tensordict)

@@ -42,6 +42,9 @@ from phihp_torchrl.worlds import GuardedWorld, World, crossings_text
 
 _log = logging.getLogger(__name__)
 
+# Seconds that the end of a run waits for a package of the plan.
+_PATIENCE = 300.0
+
 
 @dataclass(frozen=True)
 class EvaluateConfig:
@@ -156,7 +159,8 @@ class EvaluatePhase:
             self._packaging = self.agent.warm_up(background=True)
         if len(self.results) < len(self._steps):
             return self._evaluate(*self._steps[len(self.results)])
-        metrics = self._take_package()
+        self._save()  # before anything that may fail or wait
+        metrics = self._take_package() | self._missing_latency()
         self.beside = self._beside()
         self._save()
         if self.world.has_env:
@@ -198,7 +202,7 @@ class EvaluatePhase:
             _log.warning("%s is gone or damaged, and is written again.", place)
             write_atomically(place, self._text())
         try:
-            load_agent(self.directory.agent, task=self.agent.task)
+            load_agent(self.directory.agent, task=self.agent.task, packaged=False)
         except AgentError as error:
             _log.warning("%s The agent is saved again.", error)
             self._save_agent()
@@ -236,13 +240,26 @@ class EvaluatePhase:
         return measure_latency(agent, self.agent.task, calls=calls).summary()
 
     def _take_package(self) -> dict[str, float]:
-        """Wait for the package, and measure the time of a plan by it."""
+        """Wait for the package, and put it beside the agent."""
         if self._packaging is None:
             return {}
-        packaged = self._packaging.wait()
+        try:
+            packaged = self._packaging.wait(_PATIENCE)
+            if (package := self._packaging.package) is not None:
+                place_package(package, self.directory.agent)
+        except (OSError, TimeoutError) as error:
+            _log.warning("The agent has no package of its plan: %s", error)
+            packaged = False
+        self.results.get("planner", {})["packaged"] = packaged
+        return {"evaluate/planner/packaged": float(packaged)}
+
+    def _missing_latency(self) -> dict[str, float]:
+        """The time of a plan, where it was to be measured with the package."""
+        planner = self.results.get("planner")
+        if planner is None or "latency_ms_mean" in planner:
+            return {}
         latency = self._latency(self.agent)
-        if "planner" in self.results:  # it has played
-            self.results["planner"] |= {**latency, "packaged": float(packaged)}
+        planner |= latency
         return {f"evaluate/planner/{key}": value for key, value in latency.items()}
 
     def _beside(self) -> dict[str, dict[str, Any]]:
@@ -283,8 +300,6 @@ class EvaluatePhase:
             **self.agent.metadata,
         }
         save_agent(self.agent, self.directory.agent, metadata=metadata)
-        if self._packaging is not None and (package := self._packaging.package) is not None:
-            place_package(package, self.directory.agent)
 
     def _text(self) -> str:
         """The content of ``evaluation.json``."""

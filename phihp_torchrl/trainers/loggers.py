@@ -12,6 +12,7 @@ from typing import Any, Literal
 from torchrl.record.loggers import get_logger
 
 from phihp_torchrl.config import check_fields
+from phihp_torchrl.deployment import PACKAGE_FILE
 
 _log = logging.getLogger(__name__)
 
@@ -125,7 +126,9 @@ class WandbRunLogger(RunLogger):
         import wandb
 
         artifact = wandb.Artifact(name, type="agent")
-        artifact.add_dir(str(path))
+        for file in sorted(path.iterdir()):
+            if not file.name.startswith((PACKAGE_FILE, ".")):  # machine code for this machine
+                artifact.add_file(str(file))
         self._run.log_artifact(artifact)
 
     def close(self) -> None:

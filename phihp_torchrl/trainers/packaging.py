@@ -14,8 +14,8 @@ _EARNS = 60.0
 def earns_package(context: Context, agent: Agent) -> bool:
     """Whether the plan of an agent is packaged: as the settings say, or where it costs nobody much.
 
-    That is on the CPU after a minute of training, where the plan is not compiled anyway and a core
-    is to spare. Unlike what is compiled in a run, no result depends on it.
+    That is on the CPU after a minute of training, where the plan is not compiled anyway, a core is
+    to spare, and no rig waits beside it. Unlike what is compiled in a run, no result depends on it.
 
     Args:
         context: the arguments of the last phase.
@@ -26,9 +26,15 @@ def earns_package(context: Context, agent: Agent) -> bool:
         return agent.planner is not None and asked
     seconds = sum(context.directory.read_metadata().get("seconds", {}).values())
     on_cpu = next(agent.parameters()).device.type == "cpu"
-    return (
-        on_cpu and seconds >= _EARNS and not context.compile and _cores() > context.config.threads
-    )
+    if seconds < _EARNS or context.compile or not on_cpu or not context.world.copies:
+        return False
+    return _cores() > context.config.threads and _is_importable(context)
+
+
+def _is_importable(context: Context) -> bool:
+    """Whether another process finds what the task is made of, which no plugin or prompt has."""
+    parts = (context.task.reward, type(context.task.system))
+    return not context.config.plugins and all(part.__module__ != "__main__" for part in parts)
 
 
 def _cores() -> int:

@@ -100,6 +100,7 @@ class ActorEvaluation:
         later = None
         if signals is not None:
             states, later = world.task.with_signals(states, signals[0]), signals[1:]
-        _, score, _, _, change = world.returns(actor, states, self.steps, signals=later)
+        played = world.returns(actor, states, self.steps, signals=later)
         # Neither NaN nor an infinite return may win.
-        return Played(torch.where(score.isfinite(), score, -math.inf), change.mean().item())
+        returns = torch.where(played.total.isfinite(), played.total, -math.inf)
+        return Played(returns, played.change.mean().item())

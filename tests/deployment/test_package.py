@@ -1,4 +1,4 @@
-"""A packaged plan is taken only where asked for, and where it is what it claims to be."""
+"""A packaged plan is taken if it is the user's own or asked for, and is what it claims to be."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from phihp_torchrl import Agent, HybridDynamics, get_task, load_agent, save_agent
 from phihp_torchrl.agents import Actor, TwinQ
 from phihp_torchrl.config import STATE_VARIABLE
-from phihp_torchrl.deployment import AgentError, package
+from phihp_torchrl.deployment import AgentError, package, place_package
 from phihp_torchrl.planners import CEMConfig
 
 CONFIG = CEMConfig(
@@ -100,7 +100,7 @@ def test_the_users_own_package_is_taken(directory, caplog):
     assert not ours(caplog)
 
 
-@pytest.mark.parametrize("change", ["key", "signature", "package"])
+@pytest.mark.parametrize("change", ["key", "signature", "no text", "package"])
 def test_nothing_native_of_others_is_loaded_unless_asked(
     directory, tmp_path, monkeypatch, caplog, change
 ):
@@ -116,17 +116,18 @@ def test_nothing_native_of_others_is_loaded_unless_asked(
     else:
         told = place.with_name(f"{place.name}.json")
         content = json.loads(told.read_text())
-        told.write_text(json.dumps({**content, "signature": "0" * 64}))
+        signature = "0" * 64 if change == "signature" else "\ud800"
+        told.write_text(json.dumps({**content, "signature": signature}))
     with caplog.at_level(logging.INFO, logger="phihp_torchrl"):
         assert act(load_agent(directory)).isfinite().all()
     assert "was not made by you on this machine" in caplog.text
 
 
-def test_a_package_of_another_agent_is_refused(directory, caplog):
+def test_a_package_of_another_agent_is_refused(directory, tmp_path, caplog):
     other = make()
     with torch.no_grad():
         other.actor.module.mlp[0].bias.add_(0.1)
-    save_agent(other, directory)
+    shutil.copytree(save_agent(other, tmp_path / "other"), directory, dirs_exist_ok=True)
     agent = load_agent(directory, packaged=True)
     (said,) = ours(caplog)
     assert said.startswith("The agent plans eagerly")
@@ -156,6 +157,39 @@ def test_a_changed_or_missing_package_is_refused(directory, caplog):
     changed, missing = ours(caplog)
     assert "expected sha256" in changed
     assert "expected a packaged plan, found none" in missing
+
+
+def test_changed_weights_are_planned_by_eagerly(directory):
+    packaged, eager = (load_agent(directory, packaged=each) for each in (None, False))
+    for agent in (packaged, eager):
+        with torch.no_grad():
+            agent.actor.module.mlp[0].bias.add_(0.5)
+        agent.qvalue.module.load_state_dict(
+            {name: 2.0 * value for name, value in agent.qvalue.module.state_dict().items()}
+        )
+    torch.testing.assert_close(act(packaged), act(eager))
+
+
+def test_another_agent_in_the_directory_ends_the_package(directory):
+    save_agent(load_agent(directory), directory, metadata={"note": "the same agent"})
+    assert load_agent(directory).planner._functions._replaced
+    other = make()
+    with torch.no_grad():
+        other.actor.module.mlp[0].bias.add_(0.1)
+    save_agent(other, directory)
+    assert not list(directory.glob(f"*{package.PACKAGE_FILE}*"))
+
+
+def test_a_package_is_not_written_through_a_link(directory, tmp_path):
+    theirs, made = tmp_path / "theirs", tmp_path / "made"
+    theirs.write_text("not yours")
+    made.write_text("a package")
+    for name in (package.PACKAGE_FILE, package.PACKAGE_NOTE):
+        (directory / name).unlink()
+        (directory / name).symlink_to(theirs)
+    place_package(made, directory)
+    assert theirs.read_text() == "not yours"
+    assert (directory / package.PACKAGE_FILE).read_text() == "a package"
 
 
 def test_a_package_that_finds_another_plan_is_refused(directory, saved, caplog, monkeypatch):

@@ -56,6 +56,7 @@ def test_compiled_equals_eager(horizon):
         tensordict = TensorDict(observation=task.observe(state), batch_size=[3])
         noise = noise_for(eager, (3,), seed)
         torch.testing.assert_close(*(p.plan(tensordict, noise) for p in (eager, compiled)))
+    assert compiled.problem(compiled=True).in_loop is (horizon == 12)
 
 
 def test_what_cannot_compile_says_so(caplog):

@@ -44,8 +44,8 @@ def test_nothing_counts_after_a_termination():
     assert scores.tolist() == [-1.0 + 25.0, -4.0, -1.0 - 0.5 * 4.0]
 
 
-@pytest.mark.parametrize("last", [None, nan, 0.5])
-def test_a_loop_of_a_graph_scores_as_one_step_after_another(last):
+@pytest.mark.parametrize(("last", "completed"), [(None, 0), (nan, 2), (0.5, 2)])
+def test_a_loop_of_a_graph_scores_as_one_step_after_another(last, completed):
     """Some sequences end, some leave the finite numbers, and some are the actor's."""
     problem = Problem(
         model=Point(goal=0.0, wall=3.0),
@@ -60,6 +60,7 @@ def test_a_loop_of_a_graph_scores_as_one_step_after_another(last):
     options = {
         "policy_noise": torch.randn(7, 5, 1, dtype=torch.float64, generator=generator),
         "last": None if last is None else torch.full((20, 1), last, dtype=torch.float64),
+        "completed": completed,
     }
     apart, taken = score_sequences(
         state, actions, problem, gamma=0.9, alpha=0.5, change_cost=0.1, **options

@@ -25,6 +25,8 @@ def asked(
     compiled: bool = False,
     cores: int = 2,
     threads: int = 1,
+    copies: bool = True,
+    plugins: tuple[str, ...] = (),
 ) -> bool:
     monkeypatch.setattr(packaging, "_cores", lambda: cores)
     task = get_task("pendulum")
@@ -37,7 +39,9 @@ def asked(
         settings=EvaluateConfig(packaged=packaged),
         directory=SimpleNamespace(read_metadata=lambda: record),
         compile=compiled,
-        config=replace(CONFIG, threads=threads),
+        task=task,
+        world=SimpleNamespace(copies=copies),
+        config=replace(CONFIG, threads=threads, plugins=plugins),
     )
     return packaging.earns_package(context, agent)
 
@@ -48,7 +52,15 @@ def test_a_long_run_with_a_core_to_spare_leaves_one(monkeypatch):
 
 @pytest.mark.parametrize(
     "changes",
-    [{"plans": False}, {"seconds": 40.0}, {"compiled": True}, {"cores": 1}, {"threads": 2}],
+    [
+        {"plans": False},
+        {"seconds": 40.0},
+        {"compiled": True},
+        {"cores": 1},
+        {"threads": 2},
+        {"copies": False},
+        {"plugins": ("my_task.py",)},
+    ],
 )
 def test_others_do_not(monkeypatch, changes):
     assert not asked(monkeypatch, **changes)

@@ -194,7 +194,7 @@ def test_a_package_of_the_plan_lies_beside_the_agent(
     made, order = tmp_path / "made", list[str]()
     made.write_text("a package")
 
-    def wait() -> bool:
+    def wait(seconds: float) -> bool:
         order.append("wait")
         return compiles
 

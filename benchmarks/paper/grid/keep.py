@@ -69,7 +69,7 @@ def _keep_prediction(files: CellFiles) -> None:
     if not (files.run / "agent").is_dir():
         return
     try:
-        errors = _prediction_errors(load_agent(files.run / "agent"))
+        errors = _prediction_errors(load_agent(files.run / "agent", packaged=False))
     except Exception as error:  # a finished run must not be lost to an afterthought
         _log.warning("%s: its model's predictions were not measured: %s", files.run, error)
         return
