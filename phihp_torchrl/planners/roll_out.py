@@ -49,7 +49,12 @@ class Prices(NamedTuple):
     last: Tensor | None
 
     def of(self, action: Tensor, previous: Tensor) -> Tensor:
-        """The price of going from one action to another, ``[..., m]`` -> ``[...]``."""
+        """The price of going from one action to another, ``[..., m]`` -> ``[...]``.
+
+        Args:
+            action: actions.
+            previous: the actions before them; NaN for none, which costs nothing.
+        """
         change = (action - previous) / self.bounds.scale
         # Before the first action of an episode there is none, which NaN says.
         return self.change_cost * change.square().sum(-1).nan_to_num(0.0)
@@ -83,7 +88,12 @@ class Guide:
         self.noise, self.completed = noise, completed
 
     def noise_of(self, k: int, actions: Tensor) -> Tensor | None:
-        """The noise on the actor's actions in a step of these sequences, ``None`` without any."""
+        """The noise on the actor's actions in a step, ``None`` where the actor has none.
+
+        Args:
+            k: number of the step.
+            actions: the sequences, ``[H, rows, m]``.
+        """
         noise = None if self.noise is None else self.noise[k]
         if self.completed and k == len(actions) - 1:
             none = torch.zeros_like(actions[k, : self.completed])
@@ -139,7 +149,7 @@ def step_by_step(
 def in_a_loop(
     state: Tensor, actions: Tensor, model: TensorModel, guide: Guide | None, prices: Prices
 ) -> RolledOut:
-    """The same, as one loop of a graph that is compiled: it holds the step once.
+    """Roll out as one loop of a graph that is compiled, which holds the step once.
 
     A long plan then compiles in a fraction of the time that it takes written out
     (``benchmarks/speed/loaded_plans.py`` measures both).
@@ -220,7 +230,7 @@ def _guided_step(guide: Guide, actions: Tensor) -> Callable[..., Tensor]:
 def at_once(
     state: Tensor, actions: Tensor, model: Any, guide: Guide | None, prices: Prices
 ) -> RolledOut:
-    """The same, with rewards and ends of all steps together, for a model that judges apart.
+    """Roll out with the rewards and ends of all steps together, for a model that judges apart.
 
     Args:
         state: as for :func:`step_by_step`.

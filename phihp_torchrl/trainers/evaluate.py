@@ -159,10 +159,12 @@ class EvaluatePhase:
             self._packaging = self.agent.warm_up(background=True)
         if len(self.results) < len(self._steps):
             return self._evaluate(*self._steps[len(self.results)])
-        self._save()  # before anything that may fail or wait
+        self._write()  # before anything that may fail or wait
         metrics = self._take_package() | self._missing_latency()
         self.beside = self._beside()
-        self._save()
+        self._write()
+        label = f"{self.config.task}-{self.config.label}"
+        self.new_files.append(NewFile(label, self.directory.agent))
         if self.world.has_env:
             self._show()
         else:
@@ -281,11 +283,10 @@ class EvaluatePhase:
             _log.info("The agent, and its violations of constraints:\n%s", table)
         return beside
 
-    def _save(self) -> None:
+    def _write(self) -> None:
+        """Write the agent and ``evaluation.json``, with what is known of them so far."""
         self._save_agent()
         write_atomically(self.directory.evaluation, self._text())
-        label = f"{self.config.task}-{self.config.label}"
-        self.new_files.append(NewFile(label, self.directory.agent))
 
     def _save_agent(self) -> None:
         origin = (self.directory.read_metadata().get("sessions") or [{}])[0]
