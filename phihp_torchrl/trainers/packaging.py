@@ -25,7 +25,7 @@ def earns_package(context: Context, agent: Agent) -> bool:
     if agent.planner is None or asked != "auto":
         return agent.planner is not None and asked
     seconds = sum(context.directory.read_metadata().get("seconds", {}).values())
-    on_cpu = next(agent.parameters()).device.type == "cpu"
+    on_cpu = all(tensor.device.type == "cpu" for tensor in agent.parameters())
     if seconds < _EARNS or context.compile or not on_cpu or not context.world.copies:
         return False
     return _cores() > context.config.threads and _is_importable(context)

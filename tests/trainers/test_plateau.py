@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from phihp_torchrl.trainers.plateau import Plateau, Schedule
+from phihp_torchrl.trainers.policy_evaluation import Played
 
 from .trainer_parts import POLICY, assert_same_state, plain, policy_trainer
 
@@ -169,7 +170,7 @@ def test_learning_stops_at_a_plateau_and_keeps_the_best():
 def test_learning_goes_on_while_returns_rise(extension):
     trainer = policy_trainer(replace(POLICY, updates=40, patience=0.5, extension=extension))
     rising = itertools.count()
-    trainer.evaluation.imagined = lambda actor: FLAT + next(rising)
+    trainer.evaluation.imagined = lambda actor: Played(FLAT + next(rising), 0.0)
     while not trainer.done:
         end = trainer.advance()["policy/end"]
     assert trainer.updates == end == 40 + 40 * extension

@@ -29,7 +29,7 @@ def script(tmp_path, monkeypatch):
     task = replace(get_task("pendulum"), max_steps=2)
     parts = {"actor": Actor(task, (4,)), "qvalue": TwinQ(task, (4,)), "planner_config": TINY}
     agent = Agent(task, dynamics=HybridDynamics.hybrid(task), **parts)
-    monkeypatch.setattr(pareto, "load_agent", lambda path: agent)
+    monkeypatch.setattr(pareto, "load_agent", lambda path, **_: agent)
     monkeypatch.setattr(pareto, "RESULTS", tmp_path)
     return pareto
 
