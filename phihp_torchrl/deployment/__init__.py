@@ -10,11 +10,11 @@ from phihp_torchrl.deployment.defaults import plain_defaults
 from phihp_torchrl.deployment.export import export_aoti, export_onnx, largest_differences
 from phihp_torchrl.deployment.export_modules import ActorModule, PlanModule
 from phihp_torchrl.deployment.exported import ExportedAgent, load_exported
-from phihp_torchrl.deployment.files import load_agent, place_package, save_agent
+from phihp_torchrl.deployment.files import load_agent, save_agent
 from phihp_torchrl.deployment.formats import TaskSignature
 from phihp_torchrl.deployment.kinds import AGENT_KINDS, register_agent
 from phihp_torchrl.deployment.observer import VelocityObserver
-from phihp_torchrl.deployment.package import PACKAGE_FILE
+from phihp_torchrl.deployment.package import PACKAGE_FILE, place_package
 from phihp_torchrl.deployment.reading import AgentError
 from phihp_torchrl.deployment.realtime import RealTimeReport, run_realtime
 from phihp_torchrl.deployment.safety import Safety

@@ -26,21 +26,19 @@ from phihp_torchrl.config import (
 from phihp_torchrl.deployment.agent import Agent
 from phihp_torchrl.deployment.defaults import plain_defaults
 from phihp_torchrl.deployment.formats import (
+    AGENT_FILE,
     BOUNDS_OF_VERSION_1,
     FORMAT,
     FORMAT_VERSION,
+    SAVING,
     upgrade,
 )
 from phihp_torchrl.deployment.kinds import find_kind
 from phihp_torchrl.deployment.package import (
     PACKAGE_FILE,
-    PACKAGE_NOTE,
-    check_package,
-    describe,
-    identify,
-    is_of,
-    is_ours,
-    use_package,
+    drop_package_of_another,
+    place_package,
+    take_package,
     write_package,
 )
 from phihp_torchrl.deployment.reading import MAX_JSON_BYTES, AgentError, read_json, read_weights
@@ -49,12 +47,9 @@ from phihp_torchrl.origin import package_version
 from phihp_torchrl.tasks import Task
 
 _log = logging.getLogger(__name__)
-AGENT_FILE = "agent.json"
 WEIGHTS_FILE = "weights.safetensors"
 NEXT_WEIGHTS_FILE = ".next-weights.safetensors"
 """Weights of a saving that was cut off after ``agent.json`` was replaced, or before."""
-
-_SAVING = ".saving-"
 
 
 def save_agent(
@@ -128,9 +123,9 @@ def save_agent(
         raise AgentError(f"metadata: expected at most {MAX_JSON_BYTES} bytes of JSON.")
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    for left in directory.glob(f"{_SAVING}*"):  # by savings that were killed
+    for left in directory.glob(f"{SAVING}*"):  # by savings that were killed
         shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=directory, prefix=_SAVING) as temporary:
+    with tempfile.TemporaryDirectory(dir=directory, prefix=SAVING) as temporary:
         for name, payload in ((WEIGHTS_FILE, data), (AGENT_FILE, text.encode())):
             with names_file(directory / name), open(Path(temporary, name), "wb") as file:
                 file.write(payload)
@@ -139,36 +134,12 @@ def save_agent(
         os.replace(Path(temporary, WEIGHTS_FILE), directory / NEXT_WEIGHTS_FILE)
         os.replace(Path(temporary, AGENT_FILE), directory / AGENT_FILE)
         os.replace(directory / NEXT_WEIGHTS_FILE, directory / WEIGHTS_FILE)
-        _drop_package_of_another(directory)
+        drop_package_of_another(directory)
         if packaged:
             made = Path(temporary, PACKAGE_FILE)
             write_package(agent, made)
             place_package(made, directory)
     return directory
-
-
-def place_package(made: Path, directory: Path) -> None:
-    """Put a package of its plan beside a saved agent, with what says whose it is.
-
-    Args:
-        made: the package, as :func:`~phihp_torchrl.deployment.package.write_package` wrote it.
-        directory: the directory of the agent.
-    """
-    text = describe(made, identify(read_json(directory / AGENT_FILE)))
-    with tempfile.TemporaryDirectory(dir=directory, prefix=_SAVING) as temporary:
-        shutil.copyfile(made, Path(temporary, PACKAGE_FILE))
-        Path(temporary, PACKAGE_NOTE).write_text(text, encoding="utf-8")
-        for name in (PACKAGE_FILE, PACKAGE_NOTE):
-            os.replace(Path(temporary, name), directory / name)
-
-
-def _drop_package_of_another(directory: Path) -> None:
-    """Remove a package of the agent that was here before, which nobody can plan by any more."""
-    if (directory / PACKAGE_FILE).exists() and not is_of(
-        directory / PACKAGE_NOTE, identify(read_json(directory / AGENT_FILE))
-    ):
-        for name in (PACKAGE_FILE, PACKAGE_NOTE):
-            (directory / name).unlink(missing_ok=True)
 
 
 @plain_defaults()
@@ -263,35 +234,8 @@ def load_agent(
     there = (directory / PACKAGE_FILE).is_file()
     fits = there and agent.planner is not None and device.type == "cpu" and not compile
     if packaged or (packaged is None and fits):
-        _take_package(agent, directory, device, trusted=bool(packaged))
+        take_package(agent, directory, device, trusted=bool(packaged))
     return agent
-
-
-def _take_package(agent: Agent, directory: Path, device: torch.device, *, trusted: bool) -> None:
-    """Plan by a package, if it is what it should be and the user's own or trusted."""
-    identity = identify(read_json(directory / AGENT_FILE))
-    try:
-        if agent.planner is None:
-            raise AgentError("packaged: expected an agent that plans, got one without a planner.")
-        if device.type != "cpu":
-            raise AgentError(f"packaged: expected the CPU, for which it is made, got {device}.")
-        with tempfile.TemporaryDirectory(prefix="phihp-package-") as private:
-            # What is checked is what is opened, whoever else may write into the directory.
-            for name in (PACKAGE_FILE, PACKAGE_NOTE):
-                with suppress(FileNotFoundError):
-                    shutil.copyfile(directory / name, Path(private, name))
-            package = Path(private, PACKAGE_FILE)
-            if not trusted and not is_ours(package):
-                _log.info(
-                    "%s was not made by you on this machine and is not opened: it would run with "
-                    "your rights. load_agent(..., packaged=True) plans by it.",
-                    directory / PACKAGE_FILE,
-                )
-                return
-            check_package(package, identity)
-            use_package(agent, package)
-    except (AgentError, RuntimeError, OSError) as error:
-        _log.warning("The agent plans eagerly: %s", error)
 
 
 def _plans(content: Mapping[str, Any]) -> bool:

@@ -10,6 +10,10 @@ from typing import Any
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.tasks import Task
 
+AGENT_FILE = "agent.json"
+SAVING = ".saving-"
+"""Begin of the names of what is being written beside an agent."""
+
 FORMAT = "phihp_torchrl agent"
 FORMAT_VERSION = 2
 

@@ -5,7 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
+import shutil
+import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +18,8 @@ from torch import Tensor, nn
 from torch.utils import _pytree as pytree
 
 from phihp_torchrl.compilation import compile_ahead
-from phihp_torchrl.config import DIGEST, is_own_signature, own_signature
+from phihp_torchrl.config import DIGEST, digest_of, is_own_signature, own_signature
+from phihp_torchrl.deployment.formats import AGENT_FILE, SAVING
 from phihp_torchrl.deployment.manifest import platform_name, processor, torch_version
 from phihp_torchrl.deployment.reading import AgentError, read_json
 from phihp_torchrl.origin import package_version
@@ -99,6 +104,73 @@ def use_package(agent: Agent, path: Path) -> None:
     planner.replace_plan(arguments, plan)
 
 
+def place_package(made: Path, directory: Path) -> None:
+    """Put a package of its plan beside a saved agent, with what says whose it is.
+
+    Args:
+        made: the package, as :func:`write_package` wrote it.
+        directory: the directory of the agent.
+    """
+    text = describe(made, _identity(directory))
+    with tempfile.TemporaryDirectory(dir=directory, prefix=SAVING) as temporary:
+        shutil.copyfile(made, Path(temporary, PACKAGE_FILE))
+        Path(temporary, PACKAGE_NOTE).write_text(text, encoding="utf-8")
+        for name in (PACKAGE_FILE, PACKAGE_NOTE):
+            os.replace(Path(temporary, name), directory / name)
+
+
+def drop_package_of_another(directory: Path) -> None:
+    """Remove a package of the agent that was here before, which nobody can plan by any more.
+
+    Args:
+        directory: the directory of the agent.
+    """
+    note = directory / PACKAGE_NOTE
+    if (directory / PACKAGE_FILE).exists() and not _is_of(note, _identity(directory)):
+        for name in (PACKAGE_FILE, PACKAGE_NOTE):
+            (directory / name).unlink(missing_ok=True)
+
+
+def _identity(directory: Path) -> str:
+    return identify(read_json(directory / AGENT_FILE))
+
+
+def take_package(agent: Agent, directory: Path, device: torch.device, *, trusted: bool) -> None:
+    """Plan by the package in an agent's directory, if it is the user's own or trusted.
+
+    If it is not what it should be, a warning says why and the agent plans eagerly.
+
+    Args:
+        agent: the agent of that directory.
+        directory: the directory.
+        device: the device of the agent.
+        trusted: whether a package of somebody else is opened too.
+    """
+    identity = _identity(directory)
+    try:
+        if agent.planner is None:
+            raise AgentError("packaged: expected an agent that plans, got one without a planner.")
+        if device.type != "cpu":
+            raise AgentError(f"packaged: expected the CPU, for which it is made, got {device}.")
+        with tempfile.TemporaryDirectory(prefix="phihp-package-") as private:
+            # What is checked is what is opened, whoever else may write into the directory.
+            for name in (PACKAGE_FILE, PACKAGE_NOTE):
+                with suppress(FileNotFoundError):
+                    shutil.copyfile(directory / name, Path(private, name))
+            package = Path(private, PACKAGE_FILE)
+            if not trusted and not is_ours(package):
+                _log.info(
+                    "%s was not made by you on this machine and is not opened: it would run with "
+                    "your rights. load_agent(..., packaged=True) plans by it.",
+                    directory / PACKAGE_FILE,
+                )
+                return
+            check_package(package, identity)
+            use_package(agent, package)
+    except (AgentError, RuntimeError, OSError) as error:
+        _log.warning("The agent plans eagerly: %s", error)
+
+
 def describe(made: Path, identity: str) -> str:
     """What a package is for, as JSON to lie beside it, signed by whoever makes it."""
     told = {"format": _FORMAT, "sha256": _digest(made), **_here(identity)}
@@ -113,7 +185,7 @@ def describe(made: Path, identity: str) -> str:
     return json.dumps(told, indent=2) + "\n"
 
 
-def is_of(note: Path, identity: str) -> bool:
+def _is_of(note: Path, identity: str) -> bool:
     """Whether what lies beside a package says that it is of this agent."""
     try:
         return read_json(note).get("agent_sha256") == identity
@@ -174,7 +246,7 @@ def _signed(told: Mapping[str, Any]) -> str:
 
 
 def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    return digest_of(path.read_bytes())
 
 
 def _description(path: Path) -> Path:

@@ -11,7 +11,8 @@ from phihp_torchrl.planners.mppi_planner import MPPIPlanner
 from phihp_torchrl.planners.planner_checks import is_finite
 from phihp_torchrl.planners.problem import Problem, TensorModel, score_sequences
 from phihp_torchrl.planners.registry import PLANNERS, PlannerKind, make_planner, register_planner
-from phihp_torchrl.planners.sampling_planner import LONG_PLAN, SamplingPlanner
+from phihp_torchrl.planners.roll_out import LONG_PLAN
+from phihp_torchrl.planners.sampling_planner import SamplingPlanner
 from phihp_torchrl.planners.search import SearchConfig
 
 __all__ = [

@@ -14,6 +14,11 @@ from phihp_torchrl.tasks import ActionBounds
 if TYPE_CHECKING:
     from phihp_torchrl.planners.problem import TensorModel
 
+LONG_PLAN = 10
+"""Steps from which on the graph of a plan is a loop.
+
+On a GPU each turn of a loop would wait for the device, so graphs are written out there."""
+
 
 class RolledOut(NamedTuple):
     """What comes of action sequences.

@@ -40,15 +40,11 @@ from phihp_torchrl.planners.planner_checks import (
 )
 from phihp_torchrl.planners.problem import Problem, TensorModel
 from phihp_torchrl.planners.receding_horizon import RecedingHorizon
+from phihp_torchrl.planners.roll_out import LONG_PLAN
 from phihp_torchrl.planners.search import SearchConfig
 from phihp_torchrl.planners.stock_attributes import StockAttributes
 from phihp_torchrl.planners.transformed import find_tensor_model, why_no_tensor_model
 from phihp_torchrl.tasks import ActionBounds
-
-LONG_PLAN = 10
-"""Steps from which on the graph of a plan is a loop.
-
-On a GPU each turn of a loop would wait for the device, so graphs are written out there."""
 
 
 class SamplingPlanner(StockAttributes, MPCPlannerBase):

@@ -252,7 +252,8 @@ class EvaluatePhase:
         except (OSError, TimeoutError) as error:
             _log.warning("The agent has no package of its plan: %s", error)
             packaged = False
-        self.results.get("planner", {})["packaged"] = packaged
+        if "planner" in self.results:  # it has played
+            self.results["planner"]["packaged"] = packaged
         return {"evaluate/planner/packaged": float(packaged)}
 
     def _missing_latency(self) -> dict[str, float]:
@@ -261,7 +262,7 @@ class EvaluatePhase:
         if planner is None or "latency_ms_mean" in planner:
             return {}
         latency = self._latency(self.agent)
-        planner |= latency
+        planner.update(latency)
         return {f"evaluate/planner/{key}": value for key, value in latency.items()}
 
     def _beside(self) -> dict[str, dict[str, Any]]:

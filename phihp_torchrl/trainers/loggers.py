@@ -127,7 +127,8 @@ class WandbRunLogger(RunLogger):
 
         artifact = wandb.Artifact(name, type="agent")
         for file in sorted(path.iterdir()):
-            if not file.name.startswith((PACKAGE_FILE, ".")):  # machine code for this machine
+            # A package is machine code for this machine, and a dot begins what is being written.
+            if file.is_file() and not file.name.startswith((PACKAGE_FILE, ".")):
                 artifact.add_file(str(file))
         self._run.log_artifact(artifact)
 
