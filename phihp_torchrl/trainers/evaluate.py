@@ -12,14 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 from phihp_torchrl.baselines import check_names
 from phihp_torchrl.config import check_count, check_fields, check_memory, digest_of
-from phihp_torchrl.deployment import (
-    Agent,
-    AgentError,
-    WarmUp,
-    load_agent,
-    place_package,
-    save_agent,
-)
+from phihp_torchrl.deployment import Agent, AgentError, load_agent, save_agent
 from phihp_torchrl.evaluation import (
     BASELINES_KEY,
     EVALUATION_SEED,
@@ -33,7 +26,7 @@ from phihp_torchrl.evaluation import (
 from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.files import write_atomically
-from phihp_torchrl.trainers.packaging import earns_package
+from phihp_torchrl.trainers.packaging import Packaging, packages_plan
 from phihp_torchrl.trainers.phases import Phase, real_steps, register_phase
 from phihp_torchrl.trainers.return_curve import read_rows, return_curve
 from phihp_torchrl.trainers.run_config import RunConfig
@@ -41,9 +34,6 @@ from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.worlds import GuardedWorld, World, crossings_text
 
 _log = logging.getLogger(__name__)
-
-# Seconds that the end of a run waits for a package of the plan.
-_PATIENCE = 300.0
 
 
 @dataclass(frozen=True)
@@ -134,7 +124,7 @@ class EvaluatePhase:
         self.beside: dict[str, dict[str, Any]] = {}
         self.new_files: list[NewFile] = []
         self._played: Episode | None = None
-        self._packaging: WarmUp | None = None
+        self._packaging: Packaging | None = None
         self._steps: list[tuple[str, Agent]] = []
         if agent.planner is not None and world.has_env:
             self._steps.append(("planner", agent))
@@ -156,7 +146,7 @@ class EvaluatePhase:
         """Evaluate the planner, or else the actor, or else save and show the agent."""
         self.new_files = []
         if self.packaged and self._packaging is None:
-            self._packaging = self.agent.warm_up(background=True)
+            self._packaging = Packaging(self.agent)
         if len(self.results) < len(self._steps):
             return self._evaluate(*self._steps[len(self.results)])
         self._write()  # before anything that may fail or wait
@@ -245,13 +235,7 @@ class EvaluatePhase:
         """Wait for the package, and put it beside the agent."""
         if self._packaging is None:
             return {}
-        try:
-            packaged = self._packaging.wait(_PATIENCE)
-            if (package := self._packaging.package) is not None:
-                place_package(package, self.directory.agent)
-        except (OSError, TimeoutError) as error:
-            _log.warning("The agent has no package of its plan: %s", error)
-            packaged = False
+        packaged = self._packaging.take(self.directory.agent)
         if "planner" in self.results:  # it has played
             self.results["planner"]["packaged"] = packaged
         return {"evaluate/planner/packaged": float(packaged)}
@@ -358,7 +342,7 @@ def _build(context: Context) -> Phase:
     guards = collect.exploration.guards if isinstance(collect, CollectConfig) else {}
     if guards and world.truth is None:  # a simulated world is played as a model, which needs none
         world = GuardedWorld(world, guards)
-    packaged = earns_package(context, agent)
+    packaged = packages_plan(context, agent)
     return EvaluatePhase(
         agent, config, context.settings, world, context.directory, samples, packaged
     )

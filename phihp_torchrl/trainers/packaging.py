@@ -1,17 +1,52 @@
-"""When a run packages the plan of its agent, so that the agent plans by native code once loaded."""
+"""The package of its plan that a run makes, so that its agent plans by native code once loaded."""
 
 from __future__ import annotations
 
+import logging
 import os
+from pathlib import Path
 
-from phihp_torchrl.deployment import Agent
+from phihp_torchrl.deployment import Agent, place_package
 from phihp_torchrl.trainers.context import Context
+
+_log = logging.getLogger(__name__)
 
 # Seconds of training that earn a package, which takes another core half a minute.
 _EARNS = 60.0
+# Seconds that the end of a run waits for a package.
+_PATIENCE = 300.0
 
 
-def earns_package(context: Context, agent: Agent) -> bool:
+class Packaging:
+    """The plan of an agent on its way into a package, which another process compiles.
+
+    Args:
+        agent: the agent; it plans by the package once that is taken.
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        self._work = agent.warm_up(background=True)
+
+    def take(self, place: Path) -> bool:
+        """Wait for the package, and put it beside the agent that is saved in a directory.
+
+        Args:
+            place: the directory.
+
+        Returns:
+            Whether there is a package; where there is none a warning says why.
+        """
+        try:
+            packaged = self._work.wait(_PATIENCE)
+            if (package := self._work.package) is not None:
+                place_package(package, place)
+        except (OSError, TimeoutError) as error:
+            _log.warning("The agent has no package of its plan: %s", error)
+            return False
+        return packaged
+
+
+def packages_plan(context: Context, agent: Agent) -> bool:
     """Whether the plan of an agent is packaged: as the settings say, or where it costs nobody much.
 
     That is on the CPU after a minute of training, where the plan is not compiled anyway, a core is

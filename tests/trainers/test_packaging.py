@@ -43,7 +43,7 @@ def asked(
         world=SimpleNamespace(copies=copies),
         config=replace(CONFIG, threads=threads, plugins=plugins),
     )
-    return packaging.earns_package(context, agent)
+    return packaging.packages_plan(context, agent)
 
 
 def test_a_long_run_with_a_core_to_spare_leaves_one(monkeypatch):
