@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 from collections.abc import Iterator, Mapping
@@ -21,11 +20,11 @@ from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.evaluation.acted import acted, whole
 from phihp_torchrl.evaluation.episode import Episode
 from phihp_torchrl.evaluation.seeds import EVALUATION_SEED
+from phihp_torchrl.evaluation.tally import Tally
 from phihp_torchrl.evaluation.violations import Violations
 from phihp_torchrl.tasks import Task, find_task
 from phihp_torchrl.worlds import SimulatedWorld, World
 
-_log = logging.getLogger(__name__)
 AT_ONCE = 64
 """Environments of a world in which evaluation plays at once, at most."""
 DOING = "playing episodes"
@@ -206,7 +205,7 @@ def _play_model(
     # By a generator of their own, as the first states are.
     drawn = outside.draw([episodes], task.max_steps + 1, torch.Generator().manual_seed(seed))
     drawn = {name: values.to(device) for name, values in drawn.items()}
-    tally = _Tally(judged, episodes, device)
+    tally = Tally(judged, episodes, device)
     observed, taken = [world.observe(state)[0]], []
     for step in range(task.max_steps):
         if outside:
@@ -231,7 +230,7 @@ def _play_model(
 
 
 def _first_episode(
-    task: Task, tally: _Tally, observed: list[Tensor], taken: list[tuple[Tensor, Tensor]]
+    task: Task, tally: Tally, observed: list[Tensor], taken: list[tuple[Tensor, Tensor]]
 ) -> Episode:
     """The first of the episodes, of which all observations, actions and rewards are given."""
     length = int(tally.lengths[0])
@@ -257,7 +256,7 @@ def _play_rounds(
 def _play_env(policy: TensorDictModuleBase, env: EnvBase, task: Task) -> tuple[Tensor, ...]:
     """What a tally has of an episode in each world of ``env``."""
     tensordict = env.reset()
-    tally = _Tally(task, env.batch_size.numel(), tensordict.device)
+    tally = Tally(task, env.batch_size.numel(), tensordict.device)
     is_init = torch.ones([*env.batch_size, 1], dtype=torch.bool, device=tensordict.device)
     for _ in range(task.max_steps):
         tensordict = policy(tensordict.set("is_init", is_init))
@@ -282,74 +281,3 @@ def _judged(task: Task, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         return state, task.clip_action(tensordict["action"])
     registers = task.split(task.locate(before))[1]
     return state, task.command(registers, tensordict["action"])
-
-
-class _Tally:
-    """Sums the rewards and steps of the episodes that have not ended, ``[n]``."""
-
-    def __init__(self, task: Task, count: int, device: torch.device | None) -> None:
-        self.task = task
-        self.scale = task.bounds.scale.to(device or "cpu")
-        self.actions: list[Tensor] = []
-        self.returns = torch.zeros(count, dtype=torch.float64, device=device)
-        self.lengths = torch.zeros(count, dtype=torch.int64, device=device)
-        self.terminated = torch.zeros(count, dtype=torch.bool, device=device)
-        self.lost = torch.zeros(count, dtype=torch.bool, device=device)
-        self.alive = torch.ones(count, dtype=torch.bool, device=device)
-        self.violated = torch.zeros(count, len(task.constraints), dtype=torch.int64, device=device)
-        self.largest = torch.zeros(count, len(task.constraints), device=device)
-
-    def judge(self, state: Tensor, command: Tensor) -> None:
-        """Judge a step before it is added, by its next state and its command."""
-        found = self.task.limits.violations(state, command).reshape(self.largest.shape)
-        found = torch.where(self.alive.unsqueeze(-1), found.to(self.largest.dtype), 0.0)
-        self.violated += found > 0
-        self.largest = torch.maximum(self.largest, found)
-
-    def add(
-        self,
-        action: Tensor,
-        reward: Tensor,
-        terminated: Tensor,
-        done: Tensor,
-        finite: Tensor | None = None,
-    ) -> bool:
-        """Add a step; returns whether all episodes have ended.
-
-        An episode with an action, or a state (``finite`` false), that is not finite earns NaN.
-        """
-        action = action.reshape(-1, self.task.action_dim)
-        good = action.isfinite().all(-1)
-        self.lost |= self.alive & ~(good if finite is None else good & finite.reshape(-1))
-        command = self.task.clip_action(action)
-        self.actions.append(command / self.scale.to(command.dtype))
-        self.returns += torch.where(self.alive, reward.reshape(-1).to(torch.float64), 0.0)
-        self.lengths += self.alive
-        self.terminated |= self.alive & terminated.reshape(-1)
-        self.alive &= ~done.reshape(-1)
-        return not self.alive.any()
-
-    def result(self) -> tuple[Tensor, ...]:
-        """Returns, lengths, terminations, chatter ``[n]``, and violations ``[n, c]``, by episode.
-
-        Violations are the steps of each constraint, and the largest.
-        """
-        if count := int(self.lost.sum()):
-            _log.warning(
-                "In %d of %d episodes the policy's action or the state left the finite numbers; "
-                "their returns are NaN.",
-                count,
-                len(self.lost),
-            )
-        returns = torch.where(self.lost, math.nan, self.returns)
-        own = returns, self.lengths, self.terminated, self._chatter()
-        return *own, self.violated, self.largest
-
-    def _chatter(self) -> Tensor:
-        """Mean change of the action in the second half of each episode; 0 where there is none."""
-        actions = torch.stack(self.actions).double()
-        changes = actions.diff(dim=0).abs().mean(-1)  # row k is the change at step k + 1
-        step = torch.arange(1, len(actions), device=changes.device).unsqueeze(-1)
-        counts = (step >= self.lengths / 2) & (step < self.lengths)
-        total = torch.where(counts, changes, 0.0).sum(0)
-        return total / counts.sum(0).clamp_min(1)
