@@ -18,7 +18,7 @@ ACTIVATIONS = MappingProxyType(
 )
 """Activations of a residual, by the name of their class."""
 # Those that are faster to call as functions.
-_FUNCTIONS: dict[type[nn.Module], Any] = {nn.ReLU: torch.relu, nn.Tanh: torch.tanh}
+_FUNCTIONS: dict[type[nn.Module], Any] = {nn.ReLU: torch.relu, nn.Tanh: torch.sigmoid}
 
 
 class ResidualMLP(nn.Module):
@@ -122,8 +122,11 @@ class ResidualMLP(nn.Module):
         last[:-1, places] = weights[-1] * self.output_scale
         last[-1, places] = biases[-1] * self.output_scale
         weights[-1], biases[-1] = last[:-1], last[-1]
-        first = (weights[0], biases[0])
         called = [_FUNCTIONS.get(type(each), each) for each in between]
+        for k, activation in enumerate(called):
+            if activation is torch.sigmoid:
+                _take_sigmoid(weights, biases, k)
+        first = (weights[0], biases[0])
         rest = list(zip(called, weights[1:], biases[1:], strict=True))
 
         def residual(state: Tensor, action: Tensor) -> Tensor:
@@ -165,6 +168,16 @@ class ResidualMLP(nn.Module):
         inputs = torch.cat([self.system.observe(state), action], -1)
         self.input_scale.copy_(inputs.square().mean(0).sqrt().clamp_min(1e-3).reciprocal())
         self.output_scale.copy_(spread(derivative[:, list(self.outputs)]))
+
+
+def _take_sigmoid(weights: list[Tensor], biases: list[Tensor], k: int) -> None:
+    """Let a sigmoid after layer ``k`` do what a tanh did: tanh(z) = 2 sigmoid(2 z) - 1.
+
+    On a CPU a sigmoid takes a third of the time of a tanh (``results/benchmarks``).
+    """
+    weights[k], biases[k] = 2.0 * weights[k], 2.0 * biases[k]
+    biases[k + 1] = biases[k + 1] - weights[k + 1].sum(0)
+    weights[k + 1] = 2.0 * weights[k + 1]
 
 
 def spread(values: Tensor) -> Tensor:
