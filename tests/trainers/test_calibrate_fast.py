@@ -7,11 +7,14 @@ from dataclasses import replace
 
 import pytest
 
+from phihp_torchrl import load_config
+from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.trainers import (
     CalibratePhase,
 )
 from phihp_torchrl.trainers import calibrate as calibrate_module
 from phihp_torchrl.trainers.calibrate_rule import Choice
+from phihp_torchrl.trainers.calibrate_ways import faster
 
 from .calibrate_parts import SMALL, TINY, finished, make_agent
 
@@ -72,3 +75,10 @@ def test_an_interrupted_phase_goes_on_with_the_fast_budget(monkeypatch):
             phase.advance()
     assert resumed.final == begun.final
     assert "fast" in resumed.final["ways"]
+
+
+def test_the_fast_way_is_as_small_as_the_fast_budget():
+    budget = load_config("pendulum", overrides=["budget=fast"])["planner"]
+    large = CEMConfig(99, optim_steps=99, num_candidates=999, top_k=99, num_policy_candidates=99)
+    assert len(found := faster(large, {})) == 5
+    assert found == {name: budget[name] for name in found}
