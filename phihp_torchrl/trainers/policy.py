@@ -207,6 +207,7 @@ class PolicyTrainer:
             "policy/updates": float(self.updates),
             "policy/imagined_steps": float(self.learner.imagined_steps),
             "policy/imagined_return": imagined,
+            "policy/imagined_change": change,
             "policy/best_imagined_return": self.best_return,
             **{
                 f"policy/{name}": unit ** _POWERS.get(name, 0) * value.item()

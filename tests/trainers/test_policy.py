@@ -68,6 +68,7 @@ def test_work_is_counted():
             "updates",
             "imagined_steps",
             "imagined_return",
+            "imagined_change",
             "best_imagined_return",
             "real_return",
             "seconds",
