@@ -154,12 +154,30 @@ class Agent(TensorDictModuleBase):
                 seen = self._memory.extend(tensordict)
                 action = self._memory.record(self._act(seen)["action"])
                 return tensordict.set("action", action)
-            acted = self._act(tensordict)
-            if self.task.action_rate_limit is None:
-                return acted
-            task = self.task
-            _, registers = task.split(task.locate(acted["observation"]))
-            return acted.set("action", task.command(registers, acted["action"]))
+            return self.act_on_complete(tensordict)
+
+    @torch.no_grad()
+    def act_on_complete(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"action"`` as :meth:`forward` does, for the task's whole observation.
+
+        What is under way, and the estimate of a disturbance, are taken from it: who calls this
+        keeps them, as a :class:`~phihp_torchrl.deployment.Controller` does.
+        """
+        acted, task = self._act(tensordict), self.task
+        if task.action_rate_limit is None:
+            return acted
+        _, registers = task.split(task.locate(acted["observation"]))
+        return acted.set("action", task.command(registers, acted["action"]))
+
+    def follow(self, sent: Tensor) -> None:
+        """Take note of what was sent since this agent last began to act, so that it goes on there.
+
+        Args:
+            sent: commands ``[steps, *batch, m]``: the first in the place of its own action, and
+                those of steps in which it was not asked.
+        """
+        if self.planner is not None and self.planner.receding is not None:
+            self.planner.receding.follow(sent)
 
     def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.planner is not None:

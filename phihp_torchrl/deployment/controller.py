@@ -18,7 +18,7 @@ from torch import Tensor
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment.control_report import ControlReport, Tally
 from phihp_torchrl.deployment.deadline import DeadlineWorker
-from phihp_torchrl.deployment.fallback import Fallback, FallbackChain
+from phihp_torchrl.deployment.fallback import Fallback, FallbackChain, act_on
 from phihp_torchrl.deployment.observer import VelocityObserver
 from phihp_torchrl.deployment.safety import Checks, Safety
 from phihp_torchrl.deployment.under_way import UnderWay
@@ -38,8 +38,10 @@ class Controller:
     the observation or the agent's action is not fit to be used, or the agent is late, another
     controller takes over for this step. Each such step is counted with its reason.
 
-    The controller keeps the commands that are under way in the task's actuator, as they were sent
-    and not as the agent wanted them, so that an agent that was overruled still knows what acts.
+    The controller keeps what a task adds to the state: the commands that are under way, as they
+    were sent and not as the agent wanted them, the reference, and the estimate of a disturbance. So
+    an agent that was overruled still knows what acts. What is sent is within the task's own limit
+    of the action's rate, whoever chose it.
 
     Args:
         agent: an :class:`~phihp_torchrl.Agent`, planning or not, compiled or not; an exported one
@@ -94,7 +96,9 @@ class Controller:
         self._accept, self._clock = accept, clock
         self._checks = Checks(self.task, self.safety)
         self._chain = FallbackChain(agent, self.task, self._checks, fallback)
-        self._memory = UnderWay(self.task) if self.task.register_count else None
+        self._memory = None
+        if self.task.register_count:
+            self._memory = UnderWay(self.task, getattr(agent, "dynamics", None))
         self._worker = DeadlineWorker()
         self._lock = RLock()
         like = next(agent.parameters(), torch.empty(0))
@@ -109,6 +113,8 @@ class Controller:
             self._starts = True
             self._stamp: float | None = None
             self._last = self._checks.rest
+            self._unheard: list[Tensor] = []
+            """What was sent since the agent last began to act."""
             self._chain.reset()
             for part in (self._memory, self.observer):
                 if part is not None:
@@ -133,16 +139,18 @@ class Controller:
             measured = torch.as_tensor(observation, dtype=torch.float32).detach().cpu()
             seen = self._complete(measured)
             reason = self._fault(seen, timestamp, started)
-            data = self._data(seen, inputs)
+            data = self._data(seen if reason is None else torch.full_like(seen, torch.nan), inputs)
+            usable = None if reason else data
+            if reason is None and not all(map(_is_finite, inputs.values())):
+                reason = "inputs"
             action = None
             if reason is None:
+                assert data is not None
                 action, reason = self._ask(data, seen, started)
             if action is None or reason is not None:
-                usable = reason not in ("observation", "implausible", "stale")
-                action, name = self._chain.act(measured, data if usable else None, self._last)
+                action, name = self._chain.act(measured, usable, self._last)
                 self._tally.overruled(str(reason), name)
             else:
-                action = self.task.clip_action(action)  # what rounding put outside
                 self._tally.acted()
                 self._chain.reset()
             self._sent(action)
@@ -182,6 +190,11 @@ class Controller:
             )
         return found
 
+    @property
+    def estimate(self) -> Tensor | None:
+        """The estimate ``[size]`` of the task's disturbance; ``None`` without one."""
+        return None if self._memory is None else self._memory.estimate
+
     def report(self) -> ControlReport:
         """What has happened since the controller was made, or :meth:`clear_report`."""
         with self._lock:
@@ -220,13 +233,23 @@ class Controller:
                 return "stale"
         return self._checks.observation(seen)
 
-    def _data(self, seen: Tensor, inputs: dict[str, Any]) -> TensorDict:
-        like = self._like
-        entries = {key: torch.as_tensor(value).to(like) for key, value in inputs.items()}
+    def _data(self, seen: Tensor, inputs: dict[str, Any]) -> TensorDict | None:
+        """What the agent is to read; ``None`` where a first reference or input is not finite.
+
+        Later ones that are not finite are left out, so that the last value is kept.
+        """
+        like, memory = self._like, self._memory
+        finite = {key: value for key, value in inputs.items() if _is_finite(value)}
+        entries = {key: torch.as_tensor(value).to(like) for key, value in finite.items()}
         data = TensorDict(observation=seen.to(like), **entries)
-        self._remembers = self._memory is not None and self._memory.is_asked(data)
-        if self._memory is not None and self._remembers:
-            data = self._memory.extend(data)
+        if memory is not None and not memory.is_asked(data):
+            memory = None
+        self._remembers = memory is not None
+        if len(finite) < len(inputs) and not (memory is not None and memory.has_begun):
+            self._remembers = False
+            return None
+        if memory is not None:
+            data = memory.extend(data)
         return data.set("is_init", torch.tensor([self._starts], device=like.device))
 
     def _ask(
@@ -245,6 +268,7 @@ class Controller:
         self._starts = False
         if (reason := self._checks.action(action, self._last)) is not None:
             return None, reason
+        action = self._checks.command(action, self._last)
         if self._checks.violates(seen, action):
             return None, "constraint"
         if self._accept is not None and not self._accept(seen.numpy(), action.numpy()):
@@ -252,13 +276,15 @@ class Controller:
         return action, None
 
     def _run_agent(self, data: TensorDict, timeout: float | None) -> Tensor:
-        act = partial(_act, self.agent, data.clone())
-        if self.safety.deadline is None:
-            return act()
-        return self._worker.run(act, timeout)
+        act = partial(_act, self.agent, data.clone(), self._unheard)
+        waits = self.safety.deadline is not None
+        if not (waits and self._worker.busy):  # else it does not begin, and hears of them later
+            self._unheard = []
+        return self._worker.run(act, timeout) if waits else act()
 
     def _sent(self, action: Tensor) -> None:
         self._last = action
+        self._unheard.append(action.to(self._like))
         if self._memory is not None and self._remembers:
             self._memory.record(action.to(self._like))
         if self.observer is not None:
@@ -266,7 +292,15 @@ class Controller:
 
 
 @torch.no_grad()
-def _act(agent: TensorDictModuleBase, data: TensorDict) -> Tensor:
-    if data["is_init"].item() and hasattr(agent, "reset"):
-        agent.reset()  # in the agent's own thread
-    return agent(data)["action"].detach().cpu()
+def _act(agent: TensorDictModuleBase, data: TensorDict, unheard: Sequence[Tensor]) -> Tensor:
+    """The action, after the agent is told, in its own thread, what was sent since its last one."""
+    if data["is_init"].item():
+        if hasattr(agent, "reset"):
+            agent.reset()
+    elif unheard and hasattr(agent, "follow"):
+        agent.follow(torch.stack(list(unheard)))
+    return act_on(agent, data)["action"].detach().cpu()
+
+
+def _is_finite(value: Any) -> bool:
+    return bool(torch.as_tensor(value).isfinite().all())

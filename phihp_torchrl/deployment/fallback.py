@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from numpy.typing import ArrayLike, NDArray
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -25,6 +25,16 @@ Fallback = str | UserControl
 """``"actor"``, ``"hold"``, ``"zero"`` or a controller of the user's."""
 
 _NAMES = ("actor", "hold", "zero")
+
+
+def act_on(agent: TensorDictModuleBase, data: TensorDict) -> TensorDictBase:
+    """Let an agent act on an observation as it is, which its caller has completed.
+
+    Args:
+        agent: an agent, whose own memory is left out, or any module.
+        data: the observation, and what else it reads.
+    """
+    return getattr(agent, "act_on_complete", agent)(data)
 
 
 class FallbackChain:
@@ -87,16 +97,21 @@ class FallbackChain:
     def warm_up(self, data: TensorDict) -> None:
         """Call the actor once."""
         if self._actor is not None:
-            self._actor(data.clone())
+            act_on(self._actor, data.clone())
 
     def act(self, measured: Tensor, data: TensorDict | None, last: Tensor) -> tuple[Tensor, str]:
         """Return an action ``[m]`` and the name of who chose it.
+
+        An action that violates a constraint is passed over if rest would not.
 
         Args:
             measured: what was measured, ``[o]``, which may be wrong.
             data: what the agent read, or ``None`` where the measurement is not to be trusted.
             last: the action before, ``[m]``.
         """
+        checks, rest = self._checks, self._checks.towards_rest(last)
+        seen = measured if data is None else data["observation"].cpu()
+        spares = data is not None and not checks.violates(seen, rest)
         for each in self._order:
             name = each if isinstance(each, str) else getattr(each, "__name__", "user")
             try:
@@ -104,9 +119,12 @@ class FallbackChain:
             except Exception:
                 _log.exception("The fallback %s failed; the next one acts.", name)
                 continue
-            if action is not None and self._checks.action(action, last) is None:
-                return self._task.clip_action(action), name
-        return self._checks.towards_rest(last), "zero"
+            if action is None or checks.action(action, last) is not None:
+                continue
+            command = checks.command(action, last)
+            if not (spares and checks.violates(seen, command)):
+                return command, name
+        return rest, "zero"
 
     def _ask(
         self, each: Fallback, measured: Tensor, data: TensorDict | None, last: Tensor
@@ -116,7 +134,7 @@ class FallbackChain:
             return None if given is None else self._as_action(given)
         if each == "actor":
             assert self._actor is not None
-            return None if data is None else self._actor(data.clone())["action"].cpu()
+            return None if data is None else act_on(self._actor, data.clone())["action"].cpu()
         if each == "hold":
             self._held += 1
             return last if self._held <= self._checks.safety.hold_steps else None

@@ -17,6 +17,7 @@ REASONS = {
     "observation": "an observation that is not finite",
     "implausible": "an observation outside the plausible ranges, or a cosine without its sine",
     "stale": "a sample that is too old, or the one before once more",
+    "inputs": "a reference or an input that is not finite",
     "late": "no plan by the deadline",
     "error": "a plan that raised an exception",
     "not_finite": "an action that is not finite",
@@ -125,6 +126,16 @@ class Checks:
                 f"got {change!r}.",
             )
         self.change = None if change is None else torch.tensor(change).expand(task.action_dim)
+        rate = task.action_rate_limit
+        self._rate = None
+        if rate is not None:
+            self._rate = task.time_step * torch.tensor(rate).expand(task.action_dim)
+
+    def command(self, action: Tensor, last: Tensor) -> Tensor:
+        """The command for an action ``[m]``: in the task's bounds, and within its rate."""
+        if self._rate is not None:
+            action = torch.clamp(action, last - self._rate, last + self._rate)
+        return self.task.clip_action(action)
 
     def observation(self, observation: Tensor) -> str | None:
         """Why an observation ``[o]`` on the CPU cannot be acted upon, or ``None``."""
@@ -149,9 +160,8 @@ class Checks:
         low, high, _, scale = self._bounds
         if ((action < low - _ROUNDING * scale) | (action > high + _ROUNDING * scale)).any():
             return "bounds"
-        too_far = self.change is not None and (
-            (action - last).abs() > self.change + _ROUNDING * scale
-        )
+        change = (self.command(action, last) - last).abs()
+        too_far = self.change is not None and change > self.change + _ROUNDING * scale
         return "rate" if too_far is not False and too_far.any() else None
 
     def violates(self, observation: Tensor, action: Tensor) -> bool:
@@ -163,6 +173,7 @@ class Checks:
 
     def towards_rest(self, last: Tensor) -> Tensor:
         """The action ``[m]`` nearest to rest (zero, in bounds) that may follow the last one."""
+        rest = self.command(self.rest, last)
         if self.change is None:
-            return self.rest
-        return last + (self.rest - last).clamp(-self.change, self.change)
+            return rest
+        return last + (rest - last).clamp(-self.change, self.change)

@@ -55,6 +55,11 @@ class UnderWay:
         self._state = None
 
     @property
+    def has_begun(self) -> bool:
+        """Whether there has been a step since the last :meth:`reset`."""
+        return self._state is not None
+
+    @property
     def estimate(self) -> Tensor | None:
         """The estimated disturbance ``[*batch, size]``; ``None`` before the first step."""
         if self._state is None or self._model is None:

@@ -29,6 +29,7 @@ class RecedingHorizon:
         self._plans: Tensor | None = None
         self._age: Tensor | None = None
         self._last: Tensor | None = None
+        self._missed = 0
 
     def act(
         self,
@@ -47,8 +48,9 @@ class RecedingHorizon:
         """
         cold = center.expand(*batch, *center.shape)
         if self.replan_every == 1:  # every row plans at every step, so ages are not needed
-            self._plans = plan(self.recall(is_init, cold) if self.warm_start else None)
-            return self._plans[..., 0, :]
+            found = plan(self.recall(is_init, cold) if self.warm_start else None)
+            self.remember(found)
+            return found[..., 0, :]
         plans, age = self._plans, self._age
         if plans is None or age is None or not self._fits(cold):
             plans = plan(self.recall(is_init, cold) if self.warm_start else None)
@@ -67,7 +69,7 @@ class RecedingHorizon:
         return plans.gather(-2, index).squeeze(-2)
 
     def recall(self, is_init: Tensor | None, cold: Tensor) -> Tensor:
-        """Return the last plan, shifted by ``replan_every``, as the mean of the next one.
+        """Return the last plan, shifted by the steps since, as the mean of the next one.
 
         Args:
             is_init: whether an episode starts, bool ``[*batch]``; ``None`` if unknown.
@@ -76,13 +78,13 @@ class RecedingHorizon:
         """
         if self._plans is None or not self._fits(cold):
             return cold.contiguous()  # other strides would need another compiled graph
-        rest = self._plans[..., self.replan_every :, :]
-        mean = torch.cat([rest, cold[..., : self.replan_every, :]], -2)
+        steps = min(self.replan_every + self._missed, cold.shape[-2])
+        mean = torch.cat([self._plans[..., steps:, :], cold[..., :steps, :]], -2)
         return mean if is_init is None else torch.where(is_init[..., None, None], cold, mean)
 
     def remember(self, plans: Tensor) -> None:
         """Keep ``plans`` ``[*batch, H, m]`` for :meth:`recall`."""
-        self._plans = plans
+        self._plans, self._missed = plans, 0
 
     def last_action(self, is_init: Tensor | None, like: Tensor) -> Tensor:
         """Return the action that was taken last, NaN where an episode starts.
@@ -100,6 +102,20 @@ class RecedingHorizon:
     def record(self, action: Tensor) -> None:
         """Keep an action ``[*batch, m]`` for :meth:`last_action`."""
         self._last = action
+
+    def follow(self, sent: Tensor) -> None:
+        """Go on after steps in which others acted.
+
+        Args:
+            sent: the actions that were taken, ``[steps, *batch, m]``: the first in the place of the
+                last one recorded. Plans move up by the other steps.
+        """
+        self.record(sent[-1])
+        missed = len(sent) - 1
+        if self._age is None:
+            self._missed += missed
+        else:
+            self._age = self._age + missed
 
     def _fits(self, cold: Tensor) -> bool:
         plans = self._plans

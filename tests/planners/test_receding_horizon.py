@@ -65,6 +65,30 @@ def test_what_follows_the_end_of_a_plan_is_the_middle_of_the_bounds(monkeypatch)
     assert means[1].flatten().tolist() == [1.0, 2.0, 3.0, 3.0]
 
 
+def test_plans_move_up_by_the_steps_in_which_others_acted(monkeypatch):
+    _, env, _, _ = task_parts("pendulum")
+    planner = make_planner(env, warm_start=True)
+    means = scripted(planner, monkeypatch)
+    data, sent = TensorDict(batch_size=[]), torch.tensor([[0.5], [0.25], [2.0]])
+    planner.planning(data)
+    planner.receding.follow(sent)
+    assert planner.receding.last_action(None, torch.zeros(1)) == 2.0
+    for _ in range(2):
+        planner.planning(data)
+    # Of 0 to 3 the action 0 was to be taken, and two more steps have gone by.
+    assert [mean.flatten().tolist() for mean in means[1:]] == [[3, 0, 0, 0], [11, 12, 13, 0]]
+
+
+def test_a_plan_of_several_steps_is_over_earlier_where_others_acted(monkeypatch):
+    _, env, _, _ = task_parts("pendulum")
+    planner = make_planner(env, replan_every=3)
+    scripted(planner, monkeypatch)
+    data = TensorDict(batch_size=[])
+    planner.planning(data)
+    planner.receding.follow(torch.zeros(2, 1))
+    assert [planner.planning(data).item() for _ in range(2)] == [2, 10]
+
+
 def test_a_warm_start_remembers():
     task, env, _, _ = task_parts("pendulum-swingup")
     planner = make_planner(env, planning_horizon=15, optim_steps=1, warm_start=True)
