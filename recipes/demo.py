@@ -38,10 +38,11 @@ def learn(words: list[str]) -> None:
     """Learn as the words say, and put the pictures where they are easily found."""
     from torchrl.checkpoint import CheckpointError
 
-    from phihp_torchrl.commands import tell
+    from phihp_torchrl.commands import show_log, tell
     from phihp_torchrl.config import ConfigError, compose_yaml, file_error
     from phihp_torchrl.trainers import read_request, run
 
+    show_log()
     try:
         request = read_request(compose_yaml(words), words)
         result = run(request.config, request.path, resume=request.resume)

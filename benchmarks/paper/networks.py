@@ -101,6 +101,7 @@ def write_tables(results: Path) -> None:
     )
     for task in TARGETS:
         mine = [run for run in runs if run["task"] == task and run["done"]]
+        cut = sorted({r["variant"] for r in runs if r["task"] == task and not r["done"]})
         if not mine:
             continue
         floor = min(run["curve"][0]["best"] for run in mine)
@@ -139,6 +140,7 @@ def write_tables(results: Path) -> None:
         header = ["networks", "seeds", "best imagined return", "mean"]
         header += ["seconds to 98 % of the way", "seconds per 1,000 updates"]
         text += f"\n## {task}\n\n{markdown_table(header, table)}\n"
+        text += f"\nNot finished, and left out: {', '.join(cut)}.\n" if cut else ""
     origins = sorted({origin_text(run["origin"]) for run in runs})
     text += "\n" + "; ".join(origins) + ".\n\nVariants: "
     text += "; ".join(f"{k}: `{' '.join(v) or 'as set'}`" for k, v in VARIANTS.items()) + ".\n"

@@ -11,7 +11,7 @@ from phihp_torchrl.commands.console import main
 from phihp_torchrl.commands.letters import use_utf8
 
 if TYPE_CHECKING:
-    from phihp_torchrl.commands.job import tell
+    from phihp_torchrl.commands.job import show_log, tell
     from phihp_torchrl.commands.learning import Learned, learn
 
 __all__ = ["Learned", "learn"]
@@ -22,8 +22,8 @@ def __getattr__(name: str) -> Any:
         from phihp_torchrl.commands import learning
 
         return getattr(learning, name)
-    if name == "tell":
+    if name in ("show_log", "tell"):
         from phihp_torchrl.commands import job
 
-        return job.tell
+        return getattr(job, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -91,6 +91,12 @@ def job(composed: DictConfig) -> None:
     tell(result)
 
 
+def show_log() -> None:
+    """Print what this package logs on the terminal, as ``phihp train`` does."""
+    logging.basicConfig(format="%(message)s", stream=sys.stdout)
+    logging.getLogger("phihp_torchrl").setLevel(logging.INFO)
+
+
 def tell(result: RunResult) -> None:
     """Print the table of returns, the picture and what to do next; or how to go on with the run."""
     path = result.path

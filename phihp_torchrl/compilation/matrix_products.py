@@ -12,6 +12,7 @@ import functools
 import platform
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -144,8 +145,17 @@ class FasterProducts(CustomGraphPass):
 
     def uuid(self) -> bytes:
         # What was measured holds for such a machine, and so does a graph in the compiler's cache.
-        machine = platform.processor(), torch.backends.cpu.get_cpu_capability()
+        machine = _processor(), torch.backends.cpu.get_cpu_capability()
         return get_hash_for_files((__file__,), f"{machine} {torch.get_num_threads()}")
+
+
+def _processor() -> str:
+    """The name of the processor, of which Python knows nothing on most Linux systems."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    return next((line for line in lines if line.startswith("model name")), platform.processor())
 
 
 def _is_eligible(node: Any) -> bool:

@@ -8,7 +8,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,6 +57,32 @@ class _Plan(nn.Module):
         return pytree.tree_leaves(found)
 
 
+class _PackagedPlan:
+    """A planner's plan by the code of a package, as long as the weights are those it was made of.
+
+    Args:
+        planner: the planner.
+        loaded: what the package is as a function of flat tensors.
+        like: what a plan returns.
+    """
+
+    def __init__(self, planner: SamplingPlanner, loaded: Callable[..., Any], like: Any) -> None:
+        self._planner, self._loaded = planner, loaded
+        _, self._spec = pytree.tree_flatten(like)
+        self._weights = [*planner.parameters(), *planner.buffers()]
+        self._versions = [tensor._version for tensor in self._weights]
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the weights are as they were."""
+        return [tensor._version for tensor in self._weights] == self._versions
+
+    def __call__(self, *args: Any) -> Any:
+        if not self.is_current:
+            return self._planner.plan_eagerly(*args)
+        return pytree.tree_unflatten(list(self._loaded(*_tensors(args))), self._spec)
+
+
 def write_package(agent: Agent, path: Path) -> None:
     """Compile an agent's plan for one observation at a time, with its weights, into a file.
 
@@ -83,16 +109,7 @@ def use_package(agent: Agent, path: Path) -> None:
     planner = agent.planner
     assert planner is not None
     arguments, eager = planner.example_call(agent.example())
-    loaded = torch._inductor.aoti_load_package(str(path))
-    _, spec = pytree.tree_flatten(eager)
-    weights = [*planner.parameters(), *planner.buffers()]
-    known = [tensor._version for tensor in weights]
-
-    def plan(*args: Any) -> Any:
-        if [tensor._version for tensor in weights] != known:
-            return planner.plan_eagerly(*args)
-        return pytree.tree_unflatten(list(loaded(*_tensors(args))), spec)
-
+    plan = _PackagedPlan(planner, torch._inductor.aoti_load_package(str(path)), eager)
     with torch.no_grad():
         found = plan(*arguments)
     alike = torch.isclose(found.score, eager.score, rtol=_TOLERANCE, atol=_TOLERANCE)

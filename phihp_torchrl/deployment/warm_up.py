@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -47,7 +48,9 @@ class WarmUp:
         planner = agent.planner
         if planner is None:
             return
-        if reason := planner.why_not_compiled():
+        if planner.plans_ahead(agent.example()):
+            self.compiled = True
+        elif reason := planner.why_not_compiled():
             _log.warning("The plan is not compiled: %s.", reason)
         elif background:
             self._start(agent)
@@ -132,22 +135,25 @@ class WarmUp:
                 stdout=log,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, "PYTHONPATH": paths},
+                start_new_session=True,  # a Ctrl-C of the terminal is not for it
             )
         weakref.finalize(self, _end, self._process)
 
 
 def work(given: str, made: str, threads: str) -> None:
     """Compile the plan of a pickled agent: what the other process does."""
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    watched = os.getppid(), Path(given).parent
+    threading.Thread(target=_end_with, args=watched, daemon=True).start()
     torch.set_num_threads(int(threads))
     agent = pickle.loads(Path(given).read_bytes())
     write_package(agent, Path(made))
 
 
-def _end_with(parent: int) -> None:
-    """End this process when its parent has ended in a way that left it no time to say so."""
+def _end_with(parent: int, place: Path) -> None:
+    """End this process, and what it was given, when its parent has ended without a word."""
     while os.getppid() == parent:
         time.sleep(1.0)
+    shutil.rmtree(place, ignore_errors=True)
     os._exit(1)
 
 

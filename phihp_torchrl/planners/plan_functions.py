@@ -45,6 +45,11 @@ class PlanFunctions:
         """Call another function, made ahead, for arguments of the same shapes as these."""
         self._replaced[_each(arguments, _signature)] = function
 
+    def is_replaced(self, *arguments: Any) -> bool:
+        """Whether another function that is up to date is called for such arguments."""
+        found = self._replaced.get(_each(arguments, _signature))
+        return found is not None and getattr(found, "is_current", True)
+
     def call(
         self, build: Callable[[], Callable[..., Any]], compiled: bool, observation: Any, *args: Any
     ) -> Any:

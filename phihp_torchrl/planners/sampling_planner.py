@@ -287,6 +287,11 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
         """Plan by another function where the arguments have the shapes of ``args``."""
         self._functions.replace(function, *args)
 
+    def plans_ahead(self, tensordict: TensorDictBase) -> bool:
+        """Whether observations of this batch size meet a plan that was compiled ahead for them."""
+        args, _ = self.example_call(tensordict)
+        return self._functions.is_replaced(*args)
+
     def plan_eagerly(self, *args: Any) -> Any:
         """Call the plan's function for these arguments, neither compiled nor replaced."""
         return self._build(compiled=False)(*args)

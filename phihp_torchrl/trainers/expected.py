@@ -9,6 +9,7 @@ from typing import Any
 
 from phihp_torchrl.config import ConfigError, to_mapping
 from phihp_torchrl.display import duration
+from phihp_torchrl.trainers.evaluate import EvaluateConfig
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory
 
@@ -79,6 +80,8 @@ def expect(config: RunConfig, path: Path) -> Expected:
     for name in names:
         per = rates["per"].get(name)
         amount = getattr(config.section(name), per) if per else 1
+        if name == "evaluate":  # fewer than these take hardly less, for they are played at once
+            amount = max(1.0, config.section(name).episodes / EvaluateConfig().episodes)
         for end, rate in zip(ends, of.get(name) or (None,) * 3, strict=True):
             end[name] = None if rate is None else rate * amount
     about = rates["from"]

@@ -13,6 +13,8 @@ _log = logging.getLogger(__name__)
 
 # Seconds of training that earn a package, which takes another core half a minute.
 _EARNS = 60.0
+# The part of a core that is idle, at least, where one is to spare.
+_IDLE = 0.5
 # Seconds that the end of a run waits for a package.
 _PATIENCE = 300.0
 
@@ -63,7 +65,7 @@ def packages_plan(context: Context, agent: Agent) -> bool:
     on_cpu = all(tensor.device.type == "cpu" for tensor in agent.parameters())
     if seconds < _EARNS or context.compile or not on_cpu or not context.world.copies:
         return False
-    return _cores() > context.config.threads and _is_importable(context)
+    return _idle_cores(context.config.threads) >= _IDLE and _is_importable(context)
 
 
 def _is_importable(context: Context) -> bool:
@@ -72,6 +74,8 @@ def _is_importable(context: Context) -> bool:
     return not context.config.plugins and all(part.__module__ != "__main__" for part in parts)
 
 
-def _cores() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+def _idle_cores(threads: int) -> float:
+    """The cores that neither this process uses nor others did in the last minute."""
+    if not hasattr(os, "sched_getaffinity"):  # not on Linux, and then it is not known
+        return 0.0
+    return len(os.sched_getaffinity(0)) - max(threads, os.getloadavg()[0])

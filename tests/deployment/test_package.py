@@ -100,6 +100,17 @@ def test_the_users_own_package_is_taken(directory, caplog):
     assert not ours(caplog)
 
 
+def test_a_plan_that_was_taken_is_not_compiled_again_until_weights_change(directory, monkeypatch):
+    agent, compiled = load_agent(directory), []
+    monkeypatch.setattr(agent.planner, "compile_plan", compiled.append)
+    assert agent.warm_up().compiled
+    assert not compiled
+    with torch.no_grad():
+        agent.actor.module.mlp[0].bias.add_(0.1)
+    agent.warm_up()
+    assert len(compiled) == 1
+
+
 @pytest.mark.parametrize("change", ["key", "signature", "no text", "package"])
 def test_nothing_native_of_others_is_loaded_unless_asked(
     directory, tmp_path, monkeypatch, caplog, change

@@ -23,12 +23,12 @@ def asked(
     plans: bool = True,
     seconds: float = 200.0,
     compiled: bool = False,
-    cores: int = 2,
+    cores: float = 2,
     threads: int = 1,
     copies: bool = True,
     plugins: tuple[str, ...] = (),
 ) -> bool:
-    monkeypatch.setattr(packaging, "_cores", lambda: cores)
+    monkeypatch.setattr(packaging, "_idle_cores", lambda threads: cores - threads)
     task = get_task("pendulum")
     planner = CEMConfig() if plans else None
     agent = Agent(
@@ -57,6 +57,7 @@ def test_a_long_run_with_a_core_to_spare_leaves_one(monkeypatch):
         {"seconds": 40.0},
         {"compiled": True},
         {"cores": 1},
+        {"cores": 1.4},  # another run beside this one
         {"threads": 2},
         {"copies": False},
         {"plugins": ("my_task.py",)},
@@ -64,6 +65,13 @@ def test_a_long_run_with_a_core_to_spare_leaves_one(monkeypatch):
 )
 def test_others_do_not(monkeypatch, changes):
     assert not asked(monkeypatch, **changes)
+
+
+@pytest.mark.parametrize(("load", "idle"), [(0.2, 1.0), (1.1, 0.9), (2.5, -0.5)])
+def test_cores_that_others_use_are_not_to_spare(monkeypatch, load, idle):
+    monkeypatch.setattr(packaging.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr(packaging.os, "getloadavg", lambda: (load, 9.0, 9.0), raising=False)
+    assert packaging._idle_cores(1) == pytest.approx(idle)
 
 
 def test_what_is_asked_for_is_done_where_there_is_a_plan(monkeypatch):

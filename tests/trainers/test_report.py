@@ -149,6 +149,19 @@ def test_twice_the_work_takes_twice_the_time(tmp_path: Path) -> None:
     assert found == pytest.approx(2 * once)
 
 
+def test_only_more_episodes_than_usual_take_longer(tmp_path: Path) -> None:
+    pendulum = replace(CONFIG, task="pendulum")
+    settings = pendulum.section("evaluate")
+    found = []
+    for episodes in (10, 50, 200):
+        section = {"evaluate": replace(settings, episodes=episodes)}
+        config = replace(pendulum, sections={**pendulum.sections, **section})
+        found.append(expect(config, tmp_path / "x").middle["evaluate"])
+    few, usual, many = found
+    assert usual is not None
+    assert (few, many) == (usual, pytest.approx(4 * usual))
+
+
 def collected(done: list[bool], terminated: list[bool]) -> TensorDict:
     count = len(done)
     following = TensorDict(
