@@ -1,12 +1,12 @@
-"""Return against smoothness of the shipped agents: their plans, plans with a price, their actors.
+"""Return against smoothness of the shipped agents, and of plans that nothing has calibrated.
 
     python benchmarks/paper/smoothness.py --tasks pendulum-swingup cartpole
     python benchmarks/paper/smoothness.py --tasks     # table and picture of what there is
 
-Plays the agents in results/agents as they are, with a price of changes in the plan (change_cost)
-and without a plan, in the same episodes of evaluation. Chatter is what ``Evaluation.chatter``
-measures. Beside them stands what ``calibration.py`` measured. It chooses nothing. Writes
-results/smoothness/; tasks that were played before stay.
+Plays the agents in results/agents as they are, which calibration in imagination has made calm, with
+the plans of the preset, as they were before, with a price of changes in these (change_cost), and
+without plans, in the same episodes of evaluation. Chatter is what ``Evaluation.chatter`` measures.
+It chooses nothing. Writes results/smoothness/; tasks that were played before stay.
 """
 
 from __future__ import annotations
@@ -21,27 +21,30 @@ from typing import Any
 import torch
 from matplotlib.figure import Figure
 
-from phihp_torchrl import load_agent
+from phihp_torchrl import load_agent, load_config
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.evaluation import EVALUATION_SEED, TARGETS, evaluate, markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
+from phihp_torchrl.trainers import read_run_config
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/smoothness")
 PRICES = (0.3, 1.0)
-"""Prices of a change of the action, beside the plan as it was shipped."""
+"""Prices of a change of the action in the preset's plans, beside none."""
 EPISODES = 10
 
 
 def controllers(agent: Agent) -> dict[str, Agent]:
-    """The agent as it was shipped, with each price, and its actor alone."""
-    config = agent.planner_config
-    if config is None:
-        raise ValueError("agent: expected one that plans, got one without settings of a planner.")
+    """The agent as it is shipped, plans as they are before calibration, and the actor alone."""
+    search = read_run_config(load_config(agent.task.name)).planner
+    assert search is not None
     priced = {
-        f"planner, change_cost {price:g}": agent.with_planner(replace(config, change_cost=price))
+        f"plans of the preset, change_cost {price:g}": agent.with_planner(
+            replace(search, change_cost=price)
+        )
         for price in PRICES
     }
-    return {"planner as shipped": agent, **priced, "actor": agent.actor_alone()}
+    plans = {"plans of the preset": agent.with_planner(search), **priced}
+    return {"as shipped": agent, **plans, "actor": agent.actor_alone()}
 
 
 def measure(agent: Agent, episodes: int) -> dict[str, Any]:
@@ -53,23 +56,6 @@ def measure(agent: Agent, episodes: int) -> dict[str, Any]:
     return summary | lists
 
 
-def calibrated(task: str, results: Path) -> dict[str, dict[str, float]]:
-    """What whoever acts after calibration measured in ``calibration.py``, if it has played."""
-    path = results.parent / "calibration" / f"{task}.json"
-    found = json.loads(path.read_text()) if path.is_file() else {}
-    if "world" not in found:
-        return {}
-    world = found["world"]["actor" if found["acting"] == "actor" else "chosen"]
-    returns = torch.tensor(world["returns"], dtype=torch.float64)
-    return {
-        f"as calibrated, {len(returns)} episodes": {
-            "return_mean": returns.mean().item(),
-            "standard_error": (returns.std() / len(returns) ** 0.5).item(),
-            "chatter": world["chatter"],
-        }
-    }
-
-
 def write(result: Mapping[str, Any] | None, results: Path) -> None:
     """Write what a task's controllers measured, and the table and picture of all tasks so far.
 
@@ -79,8 +65,6 @@ def write(result: Mapping[str, Any] | None, results: Path) -> None:
     if result is not None:
         (results / f"{result['task']}.json").write_text(json.dumps(result, indent=1) + "\n")
     every = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
-    for each in every:
-        each["measured"] |= calibrated(each["task"], results)
     draw(every).savefig(results / "smoothness.png", dpi=110)
     rows = [
         [each["task"], name, f"{m['return_mean']:.1f}", f"{m['standard_error']:.1f}",
@@ -98,8 +82,8 @@ def write(result: Mapping[str, Any] | None, results: Path) -> None:
         f"`results/agents/` in {', '.join(map(str, episodes))} episodes of evaluation, the same "
         "for all rows of a task. Chatter is the mean change of the action from step to step in "
         "the second half of episodes, as a share of its half-range. Nothing is chosen here. *As "
-        "calibrated* is the agent that `results/calibration/` has chosen in imagination, in that "
-        "page's own episodes, whose first seed is the same.\n\n"
+        "shipped* is what calibration in imagination has chosen, a plan or the actor; *plans of "
+        "the preset* are what it chose from.\n\n"
         "![Return against chatter](smoothness.png)\n\n"
         f"{markdown_table(['task', 'controller', 'return', 's.e.', 'chatter'], rows)}\n"
         f"Not run: {', '.join(missing) or 'none'}.\n\n"
@@ -137,7 +121,7 @@ def main(words: Sequence[str] | None = None) -> None:
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     for task in arguments.tasks:
-        agent = load_agent(arguments.agents / task, planner=True)
+        agent = load_agent(arguments.agents / task, packaged=False)
         measured = {}
         for name, each in controllers(agent).items():
             measured[name] = measure(each, arguments.episodes)

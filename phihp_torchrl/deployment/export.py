@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.compilation import compile_ahead
-from phihp_torchrl.deployment.export_modules import ExportModule
+from phihp_torchrl.deployment.export_modules import ExportModule, action_of
 from phihp_torchrl.deployment.exported import Act, import_onnx, load_aoti, load_onnx
 from phihp_torchrl.deployment.manifest import Manifest
 
@@ -21,8 +21,7 @@ def export_aoti(module: ExportModule, path: str | Path) -> Act:
         path: the file to write, ending in ``.pt2``; its description goes beside it, as JSON.
 
     Returns:
-        The function in the file, loaded again: observation ``[o]``, and noise for a plan, to action
-        ``[m]``.
+        The function in the file, loaded again, of the module's inputs and outputs.
 
     Examples:
         The export compiles C++ code, which takes about a minute.
@@ -30,11 +29,14 @@ def export_aoti(module: ExportModule, path: str | Path) -> Act:
         >>> from phihp_torchrl import load_agent
         >>> module = PlanModule(load_agent("results/agents/pendulum"))  # doctest: +SKIP
         >>> act = export_aoti(module, "plan.pt2")  # doctest: +SKIP
-        >>> act(*module.example()).shape  # doctest: +SKIP
-        torch.Size([1])
+        >>> action, plan = act(*module.example())  # doctest: +SKIP
     """
     path = Path(path)
-    compile_ahead(module, module.example(), path)
+    module.in_loop = True
+    try:
+        compile_ahead(module, module.example(), path)
+    finally:
+        module.in_loop = False
     Manifest.of(module, path).write(path)
     return load_aoti(path)
 
@@ -47,8 +49,7 @@ def export_onnx(module: ExportModule, path: str | Path) -> Act:
         path: the file to write, ending in ``.onnx``; its description goes beside it, as JSON.
 
     Returns:
-        The function in the file, loaded into ONNX Runtime: observation ``[o]``, and noise for a
-        plan, to action ``[m]``.
+        The function in the file, loaded into ONNX Runtime, of the module's inputs and outputs.
 
     Raises:
         ImportError: if the ``onnx`` extra is not installed.
@@ -59,8 +60,7 @@ def export_onnx(module: ExportModule, path: str | Path) -> Act:
         >>> from phihp_torchrl import load_agent
         >>> module = PlanModule(load_agent("results/agents/pendulum"))  # doctest: +SKIP
         >>> act = export_onnx(module, "plan.onnx")  # doctest: +SKIP
-        >>> act(*module.example()).shape  # doctest: +SKIP
-        torch.Size([1])
+        >>> action, plan = act(*module.example())  # doctest: +SKIP
     """
     for name in ("onnxruntime", "onnxscript"):  # torch.onnx needs the second
         import_onnx(name)
@@ -70,7 +70,7 @@ def export_onnx(module: ExportModule, path: str | Path) -> Act:
             module,
             module.example(),
             input_names=module.input_names,
-            output_names=["action"],
+            output_names=module.output_names,
             dynamo=True,
             verbose=False,
         )
@@ -85,13 +85,13 @@ def largest_differences(act: Act, module: ExportModule, observations: Tensor) ->
 
     Args:
         act: the exported plan or actor.
-        module: the eager one, which gets the same noise.
+        module: the eager one, which gets the same noise and starts an episode as well.
         observations: observations to act on, ``[N, o]``.
     """
     differences = []
     with torch.no_grad():
         for observation in observations:
-            noise = module.draw()
-            expected = module(observation, *noise)
-            differences.append((act(observation, *noise) - expected).abs().max())
+            given = (observation, *module.draw())
+            found, expected = (action_of(each(*given)) for each in (act, module))
+            differences.append((found - expected).abs().max())
     return torch.stack(differences)

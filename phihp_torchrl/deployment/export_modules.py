@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -15,43 +16,71 @@ from phihp_torchrl.tasks import Task
 _logger = logging.getLogger(__name__)
 
 
+PLAN, LAST = "plan", "last"
+"""The names of what a plan keeps: the plan to go on from, and the action that was sent last."""
+
+
 class ExportModule(nn.Module):
     """The base of what is exported: one observation ``[o]`` to one action ``[m]``.
 
     Args:
         task: the task of the agent.
         noise_shape: shape of the standard normal noise that is a second input, or ``None``.
+        memory: further inputs that are kept from step to step, by name, with their values where an
+            episode starts.
     """
 
     part: str
     """The name of this part of an agent: ``"plan"`` or ``"actor"``."""
 
-    def __init__(self, task: Task, noise_shape: tuple[int, ...] | None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        noise_shape: tuple[int, ...] | None,
+        memory: Mapping[str, Tensor] | None = None,
+    ) -> None:
         super().__init__()
-        self.task, self.noise_shape = task, noise_shape
+        self.task, self.noise_shape, self.memory = task, noise_shape, dict(memory or {})
+        self.in_loop = False
+        """Whether the steps of a long plan are a loop of the graph, which compiles sooner."""
         self._observation = task.observe(task.sample_start([]))
 
     @property
     def input_names(self) -> list[str]:
         """The names of the inputs, in order."""
-        return ["observation"] if self.noise_shape is None else ["observation", "noise"]
+        noise = [] if self.noise_shape is None else ["noise"]
+        return ["observation", *noise, *self.memory]
+
+    @property
+    def output_names(self) -> list[str]:
+        """The names of the outputs, in order."""
+        return ["action", *([f"next_{PLAN}"] if PLAN in self.memory else [])]
 
     def draw(self) -> tuple[Tensor, ...]:
-        """Return what goes with an observation: noise, if there is some."""
-        return () if self.noise_shape is None else (torch.randn(self.noise_shape),)
+        """Return what goes with an observation where an episode starts: noise, and the memory."""
+        noise = () if self.noise_shape is None else (torch.randn(self.noise_shape),)
+        return (*noise, *self.memory.values())
 
     def example(self) -> tuple[Tensor, ...]:
-        """Return an observation, and noise if there is some, of the right shapes."""
+        """Return an observation, and what goes with it, of the right shapes."""
         return (self._observation, *self.draw())
+
+
+def action_of(found: Tensor | Sequence[Tensor]) -> Tensor:
+    """The action among the outputs of what is exported."""
+    return found if isinstance(found, Tensor) else found[0]
 
 
 class PlanModule(ExportModule):
     """One plan of an agent as a module of tensors, for export: observation and noise to action.
 
     It reads an observation ``[o]`` and standard normal noise of shape ``noise_shape``, and returns
-    an action ``[m]``. It draws no random numbers and keeps no plan between steps, so it plans at
-    every step, regardless of ``replan_every``, ``warm_start`` and ``keep_incumbent``, and the first
-    action of a plan has no ``change_cost``. A warning says which of these the agent has.
+    an action ``[m]``. It draws no random numbers and keeps nothing itself: what the planner keeps
+    from step to step is a further input, as far as its settings need it (:attr:`memory`). With
+    ``warm_start`` that is ``plan`` ``[H, m]``, for which the module returns the next one beside the
+    action; with ``change_cost`` or ``keep_incumbent`` it is ``last`` ``[m]``, the action that was
+    sent last, NaN where there is none. It plans at every step, and a warning says so where
+    ``replan_every`` is another.
 
     Args:
         agent: an agent that plans by a :class:`~phihp_torchrl.CEMPlanner`.
@@ -85,28 +114,39 @@ class PlanModule(ExportModule):
         if not getattr(planner.env.tensor_model, "compiles", True):
             raise ConfigError("agent", "expected a model whose integrator compiles, got another.")
         settings = planner.settings
-        lost = [name for name in ("warm_start", "keep_incumbent", "change_cost")
-                if getattr(settings, name)]  # fmt: skip
-        lost += ["replan_every"] if settings.replan_every != 1 else []
-        if lost:
+        if settings.replan_every != 1:
             _logger.warning(
-                "A plan that is exported keeps nothing from one step to the next, so it may change "
-                "its action more than the agent does: %s of the planner has no effect in it. "
-                "save_agent(agent, path, packaged=True) keeps all.",
-                " and ".join(lost),
+                "A plan that is exported is sought at every step: replan_every = %s has no effect "
+                "in it. save_agent(agent, path, packaged=True) keeps it.",
+                settings.replan_every,
             )
         shape = settings.noise_shape((), agent.task.action_dim)
-        super().__init__(agent.task, shape)
+        center, memory = planner.bounds.center, {}
+        if settings.warm_start:
+            memory[PLAN] = center.repeat(settings.planning_horizon, 1)
+        if settings.change_cost or settings.keep_incumbent:
+            memory[LAST] = torch.full_like(center, torch.nan)
+        super().__init__(agent.task, shape, memory)
         self.planner = planner  # whose parameters are then this module's
         # The first call keeps the filter of this shape, which an export then takes as a constant.
         colored(torch.zeros(shape), planner.settings.noise_beta, dim=1)
 
-    def forward(self, observation: Tensor, noise: Tensor) -> Tensor:
-        """Return the first action of a plan, ``[m]``."""
-        planner = self.planner
-        noise = colored(noise, planner.settings.noise_beta, dim=1)
-        found = cem_plan(observation, noise, problem=planner.problem(), settings=planner.settings)
-        return found.actions[0]
+    def forward(
+        self, observation: Tensor, noise: Tensor, *memory: Tensor
+    ) -> Tensor | tuple[Tensor, Tensor]:
+        """Return the first action of a plan, ``[m]``, and what of it the next plan starts from."""
+        planner, kept = self.planner, dict(zip(self.memory, memory, strict=True))
+        found = cem_plan(
+            observation,
+            colored(noise, planner.settings.noise_beta, dim=1),
+            kept.get(PLAN),
+            kept.get(LAST),
+            problem=planner.problem(compiled=self.in_loop),
+            settings=planner.settings,
+        )
+        if PLAN not in kept:
+            return found.actions[0]
+        return found.actions[0], torch.cat([found.actions[1:], self.memory[PLAN][-1:]])
 
 
 class ActorModule(ExportModule):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -15,24 +15,28 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from phihp_torchrl.config import ConfigError, from_mapping
+from phihp_torchrl.deployment.export_modules import LAST, PLAN, action_of
 from phihp_torchrl.deployment.manifest import Manifest, signature_of
 from phihp_torchrl.deployment.reading import AgentError
 from phihp_torchrl.tasks import Actuator, Task, find_task
 
-Act = Callable[..., Tensor]
-"""A function from observation ``[o]``, and noise if there is some, to an action ``[m]``."""
+Act = Callable[..., Any]
+"""A function from observation ``[o]``, noise and memory, as far as there are some, to an action
+``[m]``, or to it and the plan to go on from."""
 
 
 class ExportedAgent(TensorDictModuleBase):
     """An exported plan or actor, which reads ``"observation"`` ``[o]`` and writes ``"action"``.
 
-    It acts for one observation of the task at a time, and keeps nothing between steps. A
+    It acts for one observation of the task at a time, and keeps what a plan goes on from in the
+    next step, which ``"is_init"`` or :meth:`reset` forget. A
     :class:`~phihp_torchrl.deployment.Controller` adds what is under way in an actuator.
 
     Args:
         act: the function in the file.
         task: the task.
         noise_shape: shape of the standard normal noise that it takes, or ``None``.
+        memory: what it keeps from step to step, with the values where an episode starts.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -42,10 +46,31 @@ class ExportedAgent(TensorDictModuleBase):
         tensor([0.5000])
     """
 
-    def __init__(self, act: Act, task: Task, noise_shape: tuple[int, ...] | None = None) -> None:
+    def __init__(
+        self,
+        act: Act,
+        task: Task,
+        noise_shape: tuple[int, ...] | None = None,
+        memory: Mapping[str, Tensor] | None = None,
+    ) -> None:
         super().__init__()
+        self._starts = dict(memory or {})
         self.in_keys, self.out_keys = ["observation"], ["action"]
+        if self._starts:
+            self.in_keys.append("is_init")
         self.task, self._act, self._noise_shape = task, act, noise_shape
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what is kept, at the start of an episode."""
+        self._memory = dict(self._starts)
+
+    def follow(self, sent: Tensor) -> None:
+        """Take note of what was sent since it last acted, as :meth:`phihp_torchrl.Agent.follow`."""
+        self._keep(sent[-1])
+        if (plan := self._memory.get(PLAN)) is not None:
+            missed = min(len(sent) - 1, len(plan))
+            self._memory[PLAN] = torch.cat([plan[missed:], self._starts[PLAN][:missed]])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"`` ``[m]``.
@@ -60,9 +85,20 @@ class ExportedAgent(TensorDictModuleBase):
                 f"observation: expected finite numbers of shape {shape}, "
                 f"got shape {list(observation.shape)} of {observation.tolist()}."
             )
+        if (starts := tensordict.get("is_init", None)) is not None and starts.any():
+            self.reset()
         noise = () if self._noise_shape is None else (torch.randn(self._noise_shape),)
         with torch.no_grad():
-            return tensordict.set("action", self._act(observation, *noise))
+            found = self._act(observation, *noise, *self._memory.values())
+        action = action_of(found)
+        self._keep(action)
+        if PLAN in self._memory:
+            self._memory[PLAN] = found[1]
+        return tensordict.set("action", action)
+
+    def _keep(self, action: Tensor) -> None:
+        if LAST in self._memory:
+            self._memory[LAST] = action
 
 
 def load_exported(path: str | os.PathLike[str], task: str | Task | None = None) -> ExportedAgent:
@@ -104,7 +140,7 @@ def load_exported(path: str | os.PathLike[str], task: str | Task | None = None) 
     if signature != dict(manifest.task):
         differing = sorted(k for k, v in signature.items() if manifest.task.get(k) != v)
         raise AgentError(f"{path}: task {here.name!r} is another one here: {differing} differ.")
-    return ExportedAgent(_LOADERS[path.suffix](path), here, manifest.noise)
+    return ExportedAgent(_LOADERS[path.suffix](path), here, manifest.noise, manifest.starts())
 
 
 def load_aoti(path: Path) -> Act:
@@ -139,9 +175,10 @@ def load_onnx(path: Path) -> Act:
     session = onnxruntime.InferenceSession(str(path), options)
     names = [each.name for each in session.get_inputs()]
 
-    def act(*inputs: Tensor) -> Tensor:
+    def act(*inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
         arrays = {name: each.numpy() for name, each in zip(names, inputs, strict=True)}
-        return torch.from_numpy(session.run(["action"], arrays)[0])
+        found = tuple(map(torch.from_numpy, session.run(None, arrays)))
+        return found if len(found) > 1 else found[0]
 
     return act
 

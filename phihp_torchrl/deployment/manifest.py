@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from phihp_torchrl.deployment.formats import TaskSignature
 from phihp_torchrl.deployment.reading import AgentError, read_json
@@ -34,6 +36,8 @@ class Manifest:
         actuator: numbers of the task's actuator that are not those of a perfect one.
         observation: number of components of an observation.
         noise: shape of the noise, or ``None``.
+        memory: what is kept from step to step, by the names of its inputs: the values where an
+            episode starts, with ``None`` for NaN.
         sha256: digest of the exported file.
         package_version: version of this package that wrote it.
         torch_version: version of torch that wrote it, without its build.
@@ -47,6 +51,7 @@ class Manifest:
     actuator: Mapping[str, Any]
     observation: int
     noise: tuple[int, ...] | None
+    memory: Mapping[str, list[Any]]
     sha256: str
     package_version: str
     torch_version: str
@@ -64,6 +69,7 @@ class Manifest:
             actuator={} if task.actuator is None else task.actuator.config,
             observation=task.observation_dim,
             noise=module.noise_shape,
+            memory={name: _plain(value.tolist()) for name, value in module.memory.items()},
             sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
             package_version=package_version(),
             torch_version=torch_version(),
@@ -84,15 +90,28 @@ class Manifest:
         """
         place = manifest_path(path)
         content = read_json(place)
+        content.setdefault("memory", {})  # version 0.2.0 kept nothing
         names = {field.name for field in fields(cls)}
         if content.get("format") != FORMAT or set(content) != names:
             raise AgentError(f"{place}: expected the description of an exported file, got another.")
         try:
             content["noise"] = None if content["noise"] is None else tuple(content["noise"])
             content["processor"] = tuple(content["processor"])
-        except TypeError as error:
+            content["memory"] = dict(content["memory"])
+        except (TypeError, ValueError) as error:
             raise AgentError(f"{place}: expected lists of numbers and names: {error}.") from error
         return cls(**content)
+
+    def starts(self) -> dict[str, Tensor]:
+        """What is kept from step to step, with its values where an episode starts.
+
+        Raises:
+            AgentError: for anything but numbers.
+        """
+        try:
+            return {name: torch.tensor(_numbers(value)) for name, value in self.memory.items()}
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise AgentError(f"memory: expected lists of numbers, got others: {error}.") from error
 
     def check(self, path: Path, *, machine_code: bool) -> None:
         """Refuse a file that is another one, or machine code that does not run here.
@@ -118,6 +137,20 @@ class Manifest:
                 f"{path}: it was made for a processor with {', '.join(missing)}, which this one "
                 "lacks; export the agent again on this machine."
             )
+
+
+def _plain(value: Any) -> Any:
+    """Nested lists with ``None`` in the place of NaN, which JSON lacks."""
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return None if math.isnan(value) else value
+
+
+def _numbers(value: Any) -> Any:
+    """The nested lists of which :func:`_plain` made these."""
+    if isinstance(value, list):
+        return [_numbers(item) for item in value]
+    return math.nan if value is None else float(value)
 
 
 def signature_of(task: Task) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from phihp_torchrl.deployment import (
     ActorModule,
     AgentError,
     Controller,
+    ExportedAgent,
     PlanModule,
     export_aoti,
     export_onnx,
@@ -65,7 +66,7 @@ def test_module_is_the_planner(task):
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_aot_inductor(tmp_path):
-    agent = make_agent(config=SMALLEST)
+    agent = make_agent(config=replace(SMALLEST, warm_start=True))
     module = PlanModule(agent)
     act = export_aoti(module, tmp_path / "plan.pt2")
     assert (tmp_path / "plan.pt2").is_file()
@@ -79,9 +80,13 @@ def test_aot_inductor(tmp_path):
 def test_onnx(tmp_path):
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
-    agent = make_agent(config=SMALLEST)
+    agent = make_agent(config=replace(SMALLEST, warm_start=True, change_cost=0.5))
     module = PlanModule(agent)
     act = export_onnx(module, tmp_path / "plan.onnx")
+    loaded = load_exported(tmp_path / "plan.onnx")
+    for _ in range(2):
+        action = loaded(TensorDict(observation=observations(agent, 1)[0]))["action"]
+    assert action.shape == (1,)
     assert largest_differences(act, module, observations(agent)).max() < 1e-4
 
 
@@ -106,12 +111,63 @@ def test_what_cannot_be_exported():
         PlanModule(make_agent(dynamics=world.oracle()))
 
 
-def test_what_a_plan_by_itself_cannot_keep_is_said(caplog):
+def test_a_plan_is_sought_at_every_step_and_says_so(caplog):
     PlanModule(make_agent())
     assert caplog.text == ""
-    calm = replace(TINY, warm_start=True, change_cost=0.5)
-    PlanModule(make_agent(config=calm))
-    assert "warm_start and change_cost of the planner has no effect" in caplog.text
+    PlanModule(make_agent(config=replace(TINY, replan_every=2)))
+    assert "replan_every = 2 has no effect" in caplog.text
+
+
+WARM = replace(TINY, planning_horizon=3, warm_start=True, noise_beta=1.0, select="best")
+
+
+@pytest.mark.parametrize(
+    ("config", "kept"),
+    [
+        (WARM, ["plan"]),
+        (replace(WARM, change_cost=0.5, keep_incumbent=True), ["plan", "last"]),
+        (replace(TINY, change_cost=0.5), ["last"]),
+    ],
+)
+@pytest.mark.parametrize("task", ["pendulum", LOPSIDED])
+def test_an_exported_plan_goes_on_from_the_one_before_as_the_planner_does(config, kept, task):
+    agent = make_agent(task, config)
+    module = PlanModule(agent)
+    assert module.input_names == ["observation", "noise", *kept]
+    assert module.output_names == ["action", *(["next_plan"] if "plan" in kept else [])]
+    exported = ExportedAgent(module, agent.task, module.noise_shape, module.memory)
+    agent.reset()
+    with torch.no_grad():
+        for k, seen in enumerate(observations(agent, 6)):
+            starts = torch.tensor([k in (0, 4)])
+            if k == 2:  # others have acted meanwhile
+                sent = torch.full((3, 1), agent.task.action_high[0])
+                agent.follow(sent)
+                exported.follow(sent)
+            actions = []
+            for each in (agent, exported):
+                torch.manual_seed(k)
+                data = TensorDict(observation=seen, is_init=starts)
+                actions.append(each(data)["action"])
+            torch.testing.assert_close(*actions)
+
+
+def test_a_description_says_what_is_kept(tmp_path):
+    path = tmp_path / "plan.onnx"
+    path.write_bytes(b"a model")
+    module = PlanModule(make_agent(LOPSIDED, replace(WARM, change_cost=0.5)))
+    Manifest.of(module, path).write(path)
+    found = Manifest.read(path).starts()
+    assert found["plan"].tolist() == [[3.0]] * 3  # the middle of the bounds
+    assert found["last"].isnan().all()
+    content = json.loads(path.with_name("plan.onnx.json").read_text())
+    content["memory"]["plan"] = "all"
+    path.with_name("plan.onnx.json").write_text(json.dumps(content))
+    with pytest.raises(AgentError, match="memory: expected lists of numbers"):
+        Manifest.read(path).starts()
+    del content["memory"]  # as an earlier version wrote it
+    path.with_name("plan.onnx.json").write_text(json.dumps(content))
+    assert Manifest.read(path).starts() == {}
 
 
 def test_the_command_says_what_failed(tmp_path, monkeypatch, capsys):

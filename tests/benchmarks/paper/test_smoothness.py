@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import smoothness
-from phihp_torchrl import Agent, HybridDynamics, get_task, save_agent
+from phihp_torchrl import Agent, HybridDynamics, get_task, load_config, save_agent
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.planners import CEMConfig
+from phihp_torchrl.trainers import read_run_config
 
 
 def make_agent():
@@ -19,17 +21,21 @@ def make_agent():
     return Agent(task, dynamics=dynamics, actor=Actor(task), planner_config=plan)
 
 
-def test_prices_are_the_only_difference_between_the_plans():
+def test_prices_are_the_only_difference_between_the_plans_of_the_preset():
     agent = make_agent()
     found = smoothness.controllers(agent)
-    assert found["planner as shipped"] is agent
+    assert found["as shipped"] is agent
     assert found["actor"].planner is None
+    preset = found["plans of the preset"].planner_config
+    assert preset == read_run_config(load_config("cartpole")).planner
     for price in (0.3, 1.0):
-        config = found[f"planner, change_cost {price:g}"].planner_config
-        assert config == replace(agent.planner_config, change_cost=price)
+        config = found[f"plans of the preset, change_cost {price:g}"].planner_config
+        assert config == replace(preset, change_cost=price)
 
 
-def test_it_writes_what_was_played_and_names_what_was_not(tmp_path):
+def test_it_writes_what_was_played_and_names_what_was_not(tmp_path, monkeypatch):
+    small = SimpleNamespace(planner=make_agent().planner_config)
+    monkeypatch.setattr(smoothness, "read_run_config", lambda _: small)
     save_agent(make_agent(), tmp_path / "agents" / "cartpole")
     words = ["--tasks", "cartpole", "--episodes", "2"]
     words += ["--agents", str(tmp_path / "agents"), "--results", str(tmp_path / "out")]
@@ -43,21 +49,6 @@ def test_it_writes_what_was_played_and_names_what_was_not(tmp_path):
         assert f"| cartpole | {name} | {mean:.1f} |" in text
     assert "Not run: pendulum, pendulum-swingup, cartpole-swingup, acrobot" in text
     assert (tmp_path / "out" / "smoothness.png").stat().st_size > 1000
-
-
-def test_what_calibration_chose_stands_beside_what_was_played(tmp_path):
-    """Whoever acts: here the actor, with a mean of 3 and a standard error of 1."""
-    assert smoothness.calibrated("cartpole", tmp_path / "out") == {}
-    world = {"chosen": {"returns": [9.0, 9.0], "chatter": 0.5}}
-    world["actor"] = {"returns": [2.0, 4.0], "chatter": 0.1}
-    (tmp_path / "calibration").mkdir()
-    found = {"acting": "actor", "world": world}
-    (tmp_path / "calibration" / "cartpole.json").write_text(json.dumps(found))
-    played = {"return_mean": 5.0, "standard_error": 0.5, "chatter": 0.9}
-    result = {"task": "cartpole", "episodes": 2, "measured": {"actor": played}}
-    smoothness.write(result | {"origin": smoothness.describe_origin(0)}, tmp_path / "out")
-    text = (tmp_path / "out" / "README.md").read_text()
-    assert "| cartpole | as calibrated, 2 episodes | 3.0 | 1.0 | 0.100 |" in text
     (tmp_path / "out" / "README.md").unlink()
     smoothness.main(["--tasks", "--results", str(tmp_path / "out")])
     assert (tmp_path / "out" / "README.md").read_text() == text
