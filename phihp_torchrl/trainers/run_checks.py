@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import torch
 
 from phihp_torchrl.config import ConfigError, resolve_seconds
@@ -12,6 +14,14 @@ from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.strategies import strategies_of
 from phihp_torchrl.worlds import World
+
+_log = logging.getLogger(__name__)
+
+# Steps of an episode for each of a discount's time constant, from which on it is short-sighted: the
+# paper's tasks have 2 to 5, and with 10 a mountain car climbs.
+_SHORT_SIGHTED = 20.0
+# Those that TD-MPC2 chooses (Hansen et al., 2024, appendix).
+_USUAL = 5.0
 
 
 def check_run(config: RunConfig, world: World) -> None:
@@ -53,6 +63,7 @@ def check_run(config: RunConfig, world: World) -> None:
             make_start_states(task, policy.start, data, None if task.coverage is None else data)
         except ConfigError as error:
             raise ConfigError("policy.start", error.reason) from error
+        _warn_of_short_sight(task, resolve_seconds(policy, task.time_step).td3.gamma)
     if getattr(config.sections.get("policy"), "draw_constants", False):
         _check_drawing(config, task)
     if world.truth is None:
@@ -67,6 +78,24 @@ def check_run(config: RunConfig, world: World) -> None:
             raise ConfigError(
                 "model.kind", f"expected another than 'oracle': {world} has no truth to plan with."
             )
+
+
+def _warn_of_short_sight(task: Task, gamma: float) -> None:
+    """Say so where a discount forgets what comes after a small part of an episode."""
+    if gamma >= 1.0 or (steps := 1.0 / (1.0 - gamma)) * _SHORT_SIGHTED > task.max_steps:
+        return
+    seconds = task.time_step
+    _log.warning(
+        "policy.td3.gamma = %.4g counts rewards for about %.0f steps, which are %.2g s, and "
+        "episodes have %d steps, %.4g s. If what matters comes later, give it a time "
+        "(policy.td3.gamma='%.2g s'), or choose a longer time_step.",
+        gamma,
+        steps,
+        steps * seconds,
+        task.max_steps,
+        task.max_steps * seconds,
+        task.max_steps * seconds / _USUAL,
+    )
 
 
 def _check_drawing(config: RunConfig, task: Task) -> None:
