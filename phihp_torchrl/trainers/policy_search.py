@@ -251,15 +251,20 @@ class PolicySearch:
         return trainer.rollouts.returns(actor, states, steps).total
 
     def _end(self, stuck: bool, share: float, score: float) -> None:
-        """End the present way: begin the next one if it is stuck, or say what has worked."""
+        """End the present way: begin the next one if it or the best is stuck, or say what worked.
+
+        A way may leave the floor from most starts, and earn less than one that does not.
+        """
         name, after = self.way, self.tried + 1
         limit = self.config.max_seconds
         out_of_time = limit is not None and self.trainer.seconds > limit
-        if stuck and after < len(self.ways) and not out_of_time:
+        if (stuck or self.stuck) and after < len(self.ways) and not out_of_time:
+            text = "Imagined returns stay at the floor with strategy %r after %d updates"
+            if not stuck:
+                text = "Strategy %r earns less after %d updates than one that is at the floor"
             _log.warning(
-                "Imagined returns stay at the floor with strategy %r after %d updates: from %.0f "
-                "%% of the starts the actor earns no more than by doing nothing or anything (mean "
-                "%.4g). Trying strategy %r, which %s.",
+                f"{text}: from %.0f %% of the starts the actor earns no more than by doing nothing "
+                "or anything (mean %.4g). Trying strategy %r, which %s.",
                 name,
                 self.trainer.progress[0],
                 100 * share,

@@ -93,6 +93,22 @@ def test_an_actor_above_the_floor_ends_the_search(monkeypatch: pytest.MonkeyPatc
     assert phase.planner_changes == {"gamma": math.exp(-0.5)}  # the critics' discount
 
 
+def test_the_search_goes_on_while_the_actor_that_earns_most_is_at_the_floor(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    shares = iter([1.0, 1.0, 0.2, 0.1, 0.2, 0.1])
+    monkeypatch.setattr(Floor, "share", lambda self, returns: next(shares))
+    earned = [5.0, 1.0, 7.0]
+    monkeypatch.setattr(
+        PolicySearch, "_returns", lambda self, *_: torch.full((8,), earned[self.tried])
+    )
+    phase = search(sparse(never))
+    run(phase)
+    tried = ["as-set", "goal", "analytic"]
+    assert phase.summary == {"tried": tried, "kept": "analytic", "at_floor": False}
+    assert "Strategy 'goal' earns less after 8 updates than one" in caplog.text
+
+
 def test_skill_near_the_goal_is_given_time_to_spread(monkeypatch: pytest.MonkeyPatch) -> None:
     shares = iter([1.0, 0.8, 0.1])
     monkeypatch.setattr(Floor, "share", lambda self, returns: next(shares))
