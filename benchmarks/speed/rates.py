@@ -5,8 +5,8 @@
 It writes ``phihp_torchrl/trainers/rates.json``: by method, preset, task and phase, the 10th, 50th
 and 90th percentile over runs of the seconds for each unit of the setting that says how much work
 there is. Where several directories have runs of a method, preset and task, the last that is named
-decides: it has the newest. The evaluation's time hardly depends on its episodes, which are played
-as a batch.
+decides: it has the newest. An evaluation's time is that of the usual number of episodes, which are
+played as a batch.
 """
 
 from __future__ import annotations
