@@ -9,10 +9,12 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule
 
-from phihp_torchrl import HybridDynamics, WorldModelEnv, get_task
+from phihp_torchrl import HybridDynamics, WorldModelEnv, get_task, load_agent
 from phihp_torchrl.agents import Actor, act
 from phihp_torchrl.dynamics import TaskWorldModel
-from phihp_torchrl.imagination import Rollouts, Worlds, draw_noise
+from phihp_torchrl.imagination import Returns, Rollouts, Worlds, draw_noise, sum_rewards
+
+AGENT, STEPS = "results/agents/pendulum-swingup", 200
 
 
 @pytest.mark.parametrize(("worlds", "steps"), [(64, 4), (1, 2)])
@@ -65,3 +67,28 @@ def test_transitions(benchmark, report, worlds, steps):
         "actor's shapes."
     )
     report(f"Imagined steps of {worlds} worlds", times, note, work=steps)
+
+
+def test_returns(benchmark, report):
+    agent = load_agent(AGENT)
+    task = agent.task
+    rollouts = Rollouts(TaskWorldModel(task, agent.dynamics), act, max_age=task.max_steps)
+    weights = [layer.detach() for layer in agent.actor.module.mlp.parameters()]
+    states = task.reset.sample([64])
+
+    def one_by_one():
+        start = Returns.from_state(states, task.bounds)
+        model = rollouts.world_model.prepared()
+        return sum_rewards(model, act, weights, start, task.bounds, STEPS)
+
+    times = race(
+        benchmark,
+        {
+            "rewards of all steps together": lambda: rollouts.returns(weights, states, STEPS),
+            "one step after the other": one_by_one,
+        },
+        rounds=20,
+    )
+    note = f"PendulumSwingup, the actor's returns of {STEPS} steps from 64 states, eager."
+    ratios = report("Returns of an actor in imagination", times, note)
+    assert ratios["one step after the other"] > 1

@@ -15,6 +15,7 @@ from phihp_torchrl.imagination.rollouts import (
     draw_noise,
     step_worlds,
     sum_rewards,
+    sum_rewards_at_once,
 )
 from phihp_torchrl.imagination.signal_stream import SignalStream
 from phihp_torchrl.imagination.start_states import (
