@@ -142,10 +142,7 @@ class ResidualMLP(nn.Module):
     def _from_features(self, weight: Tensor) -> Tensor:
         """The first layer for cosines, sines and values of all components, and the action."""
         system, n = self.system, self.system.state_dim
-        columns: list[int] = []
-        for i in range(n):
-            columns += [i, n + i] if i in system.angle_indices else [2 * n + i]
-        columns += range(3 * n, 3 * n + system.acting_dim)
+        columns = [*system.feature_columns(), *range(3 * n, 3 * n + system.acting_dim)]
         whole = weight.new_zeros(3 * n + system.acting_dim, weight.shape[1])
         whole[columns] = weight
         return whole

@@ -238,6 +238,20 @@ class System:
             columns += [component.cos(), component.sin()] if name in angles else [component]
         return torch.stack(columns, -1)
 
+    def feature_columns(self) -> list[int]:
+        """Where :meth:`observe` is among cosines, sines and values of all components, ``[3 n]``.
+
+        Examples:
+            >>> from phihp_torchrl.systems import Pendulum
+            >>> state = torch.tensor([0.5, 2.0])  # an angle, and its velocity
+            >>> features = torch.cat([state.cos(), state.sin(), state])
+            >>> columns = Pendulum().feature_columns()
+            >>> columns, torch.equal(features[columns], Pendulum().observe(state))
+            ([0, 2, 5], True)
+        """
+        n, angles = self.state_dim, self.angle_indices
+        return [k for i in range(n) for k in ((i, n + i) if i in angles else (2 * n + i,))]
+
     def locate(self, observation: Tensor) -> Tensor:
         """Map an observation back to the state, angles in [-pi, pi]; inverts :meth:`observe`."""
         angles = self.angle_indices
