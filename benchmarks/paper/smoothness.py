@@ -37,6 +37,8 @@ def controllers(agent: Agent) -> dict[str, Agent]:
     """The agent as it is shipped, plans as they are before calibration, and the actor alone."""
     search = read_run_config(load_config(agent.task.name)).planner
     assert search is not None
+    if agent.planner_config is not None:  # the critics' discount, which a strategy may have changed
+        search = replace(search, gamma=agent.planner_config.gamma)
     priced = {
         f"plans of the preset, change_cost {price:g}": agent.with_planner(
             replace(search, change_cost=price)

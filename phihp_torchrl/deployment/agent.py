@@ -143,6 +143,10 @@ class Agent(TensorDictModuleBase):
         are in the observation: ``[*batch, k]``, or with their preview ``[*batch, rows, k]``. They
         are needed where an episode starts; later steps keep the last value if the key is missing.
 
+        With a key ``"is_complete"`` the observation is taken as it is, with the estimate of a
+        disturbance in it: somebody else keeps that, as a
+        :class:`~phihp_torchrl.deployment.Controller` does.
+
         Args:
             tensordict: the observations.
             tensordict_out: where the action is written. Defaults to ``tensordict``.
@@ -154,30 +158,21 @@ class Agent(TensorDictModuleBase):
                 seen = self._memory.extend(tensordict)
                 action = self._memory.record(self._act(seen)["action"])
                 return tensordict.set("action", action)
-            return self.act_on_complete(tensordict)
+            acted, task = self._act(tensordict), self.task
+            if task.action_rate_limit is None:
+                return acted
+            _, registers = task.split(task.locate(acted["observation"]))
+            return acted.set("action", task.command(registers, acted["action"]))
 
-    @torch.no_grad()
-    def act_on_complete(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``"action"`` as :meth:`forward` does, for the task's whole observation.
-
-        What is under way, and the estimate of a disturbance, are taken from it: who calls this
-        keeps them, as a :class:`~phihp_torchrl.deployment.Controller` does.
-        """
-        acted, task = self._act(tensordict), self.task
-        if task.action_rate_limit is None:
-            return acted
-        _, registers = task.split(task.locate(acted["observation"]))
-        return acted.set("action", task.command(registers, acted["action"]))
-
-    def follow(self, sent: Tensor) -> None:
-        """Take note of what was sent since this agent last began to act, so that it goes on there.
+    def follow(self, sent: Tensor, missed: int = 0) -> None:
+        """Go on from what was sent since this agent last acted.
 
         Args:
-            sent: commands ``[steps, *batch, m]``: the first in the place of its own action, and
-                those of steps in which it was not asked.
+            sent: the command ``[*batch, m]`` that was sent last, in the place of its own action.
+            missed: steps since then in which it was not asked.
         """
         if self.planner is not None and self.planner.receding is not None:
-            self.planner.receding.follow(sent)
+            self.planner.receding.follow(sent, missed)
 
     def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.planner is not None:

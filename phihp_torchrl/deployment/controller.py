@@ -18,10 +18,10 @@ from torch import Tensor
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment.control_report import ControlReport, Tally
 from phihp_torchrl.deployment.deadline import DeadlineWorker
-from phihp_torchrl.deployment.fallback import Fallback, FallbackChain, act_on
+from phihp_torchrl.deployment.fallback import Fallback, FallbackChain
 from phihp_torchrl.deployment.observer import VelocityObserver
 from phihp_torchrl.deployment.safety import Checks, Safety
-from phihp_torchrl.deployment.under_way import UnderWay
+from phihp_torchrl.deployment.under_way import COMPLETE, UnderWay
 from phihp_torchrl.tasks import Task, find_task
 
 _log = logging.getLogger(__name__)
@@ -113,8 +113,8 @@ class Controller:
             self._starts = True
             self._stamp: float | None = None
             self._last = self._checks.rest
-            self._unheard: list[Tensor] = []
-            """What was sent since the agent last began to act."""
+            self._unheard = 0
+            """Steps of which something was sent since the agent last began to act."""
             self._chain.reset()
             for part in (self._memory, self.observer):
                 if part is not None:
@@ -246,10 +246,9 @@ class Controller:
             memory = None
         self._remembers = memory is not None
         if len(finite) < len(inputs) and not (memory is not None and memory.has_begun):
-            self._remembers = False
             return None
         if memory is not None:
-            data = memory.extend(data)
+            data = memory.extend(data).set(COMPLETE, torch.ones(1, dtype=torch.bool))
         return data.set("is_init", torch.tensor([self._starts], device=like.device))
 
     def _ask(
@@ -258,14 +257,15 @@ class Controller:
         """The agent's action and why it must not be used, one of which is ``None``."""
         deadline = self.safety.deadline
         left = None if deadline is None else max(0.0, deadline - (self._clock() - started))
+        starts = self._starts
         try:
             action = self._run_agent(data, left)
         except TimeoutError:
             return None, "late"
         except Exception:
             _log.exception("The agent failed; the fallback acts.")
+            self._starts, self._unheard = starts, 1  # it has not acted in this step
             return None, "error"
-        self._starts = False
         if (reason := self._checks.action(action, self._last)) is not None:
             return None, reason
         action = self._checks.command(action, self._last)
@@ -276,30 +276,34 @@ class Controller:
         return action, None
 
     def _run_agent(self, data: TensorDict, timeout: float | None) -> Tensor:
-        act = partial(_act, self.agent, data.clone(), self._unheard)
         waits = self.safety.deadline is not None
-        if not (waits and self._worker.busy):  # else it does not begin, and hears of them later
-            self._unheard = []
+        if waits and timeout is not None and self._worker.busy:
+            raise TimeoutError("an earlier call is still at work")
+        act = partial(_act, self.agent, data.clone(), self._last.to(self._like), self._unheard)
+        self._starts, self._unheard = False, 0  # for now it begins, in time or not
         return self._worker.run(act, timeout) if waits else act()
 
     def _sent(self, action: Tensor) -> None:
         self._last = action
-        self._unheard.append(action.to(self._like))
+        self._unheard += 1
         if self._memory is not None and self._remembers:
-            self._memory.record(action.to(self._like))
+            try:
+                self._memory.record(action.to(self._like))
+            except Exception:
+                _log.exception("The model failed; what is under way is as it was.")
         if self.observer is not None:
             self.observer.acted(action)
 
 
 @torch.no_grad()
-def _act(agent: TensorDictModuleBase, data: TensorDict, unheard: Sequence[Tensor]) -> Tensor:
+def _act(agent: TensorDictModuleBase, data: TensorDict, last: Tensor, unheard: int) -> Tensor:
     """The action, after the agent is told, in its own thread, what was sent since its last one."""
     if data["is_init"].item():
         if hasattr(agent, "reset"):
             agent.reset()
     elif unheard and hasattr(agent, "follow"):
-        agent.follow(torch.stack(list(unheard)))
-    return act_on(agent, data)["action"].detach().cpu()
+        agent.follow(last, unheard - 1)
+    return agent(data)["action"].detach().cpu()
 
 
 def _is_finite(value: Any) -> bool:

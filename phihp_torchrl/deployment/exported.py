@@ -65,11 +65,10 @@ class ExportedAgent(TensorDictModuleBase):
         """Forget what is kept, at the start of an episode."""
         self._memory = dict(self._starts)
 
-    def follow(self, sent: Tensor) -> None:
-        """Take note of what was sent since it last acted, as :meth:`phihp_torchrl.Agent.follow`."""
-        self._keep(sent[-1])
-        if (plan := self._memory.get(PLAN)) is not None:
-            missed = min(len(sent) - 1, len(plan))
+    def follow(self, sent: Tensor, missed: int = 0) -> None:
+        """Go on from what was sent since it last acted, as :meth:`phihp_torchrl.Agent.follow`."""
+        self._keep(sent)
+        if missed and (plan := self._memory.get(PLAN)) is not None:
             self._memory[PLAN] = torch.cat([plan[missed:], self._starts[PLAN][:missed]])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -98,7 +97,7 @@ class ExportedAgent(TensorDictModuleBase):
 
     def _keep(self, action: Tensor) -> None:
         if LAST in self._memory:
-            self._memory[LAST] = action
+            self._memory[LAST] = action.clone()
 
 
 def load_exported(path: str | os.PathLike[str], task: str | Task | None = None) -> ExportedAgent:

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 from numpy.typing import ArrayLike, NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -25,16 +25,6 @@ Fallback = str | UserControl
 """``"actor"``, ``"hold"``, ``"zero"`` or a controller of the user's."""
 
 _NAMES = ("actor", "hold", "zero")
-
-
-def act_on(agent: TensorDictModuleBase, data: TensorDict) -> TensorDictBase:
-    """Let an agent act on an observation as it is, which its caller has completed.
-
-    Args:
-        agent: an agent, whose own memory is left out, or any module.
-        data: the observation, and what else it reads.
-    """
-    return getattr(agent, "act_on_complete", agent)(data)
 
 
 class FallbackChain:
@@ -97,7 +87,7 @@ class FallbackChain:
     def warm_up(self, data: TensorDict) -> None:
         """Call the actor once."""
         if self._actor is not None:
-            act_on(self._actor, data.clone())
+            self._actor(data.clone())
 
     def act(self, measured: Tensor, data: TensorDict | None, last: Tensor) -> tuple[Tensor, str]:
         """Return an action ``[m]`` and the name of who chose it.
@@ -134,7 +124,7 @@ class FallbackChain:
             return None if given is None else self._as_action(given)
         if each == "actor":
             assert self._actor is not None
-            return None if data is None else act_on(self._actor, data.clone())["action"].cpu()
+            return None if data is None else self._actor(data.clone())["action"].cpu()
         if each == "hold":
             self._held += 1
             return last if self._held <= self._checks.safety.hold_steps else None

@@ -14,6 +14,9 @@ from phihp_torchrl.tasks import DisturbancePart, Task
 
 _log = logging.getLogger(__name__)
 
+COMPLETE = "is_complete"
+"""The key that says that somebody has completed an observation already."""
+
 
 class UnderWay:
     """Completes observations of the system by what a task adds to its state.
@@ -49,15 +52,12 @@ class UnderWay:
         self._state: Tensor | None = None
         """The state ``[*batch, n]`` that the model expects next, or at first sees."""
         self._doubted: set[str] = set()
+        self.has_begun = False
+        """Whether an observation was completed since the last :meth:`reset`."""
 
     def reset(self) -> None:
         """Forget what is under way, the reference and the estimate."""
-        self._state = None
-
-    @property
-    def has_begun(self) -> bool:
-        """Whether there has been a step since the last :meth:`reset`."""
-        return self._state is not None
+        self._state, self.has_begun = None, False
 
     @property
     def estimate(self) -> Tensor | None:
@@ -68,6 +68,8 @@ class UnderWay:
 
     def is_asked(self, tensordict: TensorDictBase) -> bool:
         """Whether an observation lacks something, or has a disturbance that is to be estimated."""
+        if COMPLETE in tensordict.keys():  # noqa: SIM118 (a TensorDict is no mapping)
+            return False
         observation = tensordict.get("observation", None)
         sizes = {self.task.system.observation_dim, self.task.shown_dim} - {
             self.task.observation_dim
@@ -100,7 +102,8 @@ class UnderWay:
             given = task.split(task.locate(task.complete(shown, registers)))[1]
             registers = self._with_estimate(given, registers)
         elif task.outside:
-            registers = self._read(tensordict, registers, starts)
+            first = starts if self.has_begun else torch.ones_like(starts)
+            registers = self._read(tensordict, registers, first)
         physical = task.system.locate(seen)
         if self._model is not None and expected is not None:
             error = task.system.difference(physical, task.split(expected)[0])
@@ -109,16 +112,20 @@ class UnderWay:
             # A prediction of a state that was not finite says nothing.
             use = ~starts & corrected.isfinite().all(-1, keepdim=True)
             registers = self._put(registers, torch.where(use, corrected, estimate))
-        self._state = torch.cat([physical, registers], -1)
+        self._state, self.has_begun = torch.cat([physical, registers], -1), True
         return tensordict.copy().set("observation", task.complete(seen, registers))
 
     def record(self, action: Tensor) -> Tensor:
-        """Remember the action ``[*batch, m]`` of a step for which :meth:`extend` was asked.
+        """Remember the action ``[*batch, m]`` of a step, of which :meth:`extend` has the state.
+
+        Where an episode starts without an observation, nothing is known of the state but that.
 
         Returns:
             The command, which is the action within its bounds and its rate.
         """
-        assert self._state is not None
+        if self._state is None:
+            size = [*action.shape[:-1], self.task.system.state_dim]
+            self._state = self.task.at_rest(action.new_full(size, torch.nan))
         physical, registers = self.task.split(self._state)
         command = self.task.command(registers, action)
         if self._model is not None:

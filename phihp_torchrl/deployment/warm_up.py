@@ -48,10 +48,10 @@ class WarmUp:
         planner = agent.planner
         if planner is None:
             return
-        if planner.plans_ahead(agent.example()):
-            self.compiled = True
-        elif reason := planner.why_not_compiled():
+        if reason := planner.why_not_compiled():
             _log.warning("The plan is not compiled: %s.", reason)
+        elif planner.plans_ahead(agent.example()):
+            self.compiled = True
         elif background:
             self._start(agent)
         else:
@@ -126,7 +126,8 @@ class WarmUp:
                 error,
             )
             return
-        words = [sys.executable, "-c", _CHILD, str(given), str(made), str(torch.get_num_threads())]
+        numbers = str(torch.get_num_threads()), str(os.getpid())
+        words = [sys.executable, "-c", _CHILD, str(given), str(made), *numbers]
         paths = os.pathsep.join(path for path in sys.path if path)
         with open(Path(self._place.name, "log"), "wb") as log:
             self._process = subprocess.Popen(
@@ -140,9 +141,9 @@ class WarmUp:
         weakref.finalize(self, _end, self._process)
 
 
-def work(given: str, made: str, threads: str) -> None:
+def work(given: str, made: str, threads: str, parent: str) -> None:
     """Compile the plan of a pickled agent: what the other process does."""
-    watched = os.getppid(), Path(given).parent
+    watched = int(parent), Path(given).parent
     threading.Thread(target=_end_with, args=watched, daemon=True).start()
     torch.set_num_threads(int(threads))
     agent = pickle.loads(Path(given).read_bytes())

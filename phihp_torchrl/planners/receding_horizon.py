@@ -61,25 +61,32 @@ class RecedingHorizon:
                 age = age.masked_fill(is_init, self.replan_every)
             due = age >= self.replan_every
             if due.any():
-                mean = self.recall(is_init, cold) if self.warm_start else None
+                mean = self.recall(is_init, cold, age) if self.warm_start else None
                 plans = torch.where(due[..., None, None], plan(mean), plans)
                 age = age.masked_fill(due, 0)
         self._plans, self._age = plans, age
         index = age[..., None, None].expand(*batch, 1, center.shape[-1])
         return plans.gather(-2, index).squeeze(-2)
 
-    def recall(self, is_init: Tensor | None, cold: Tensor) -> Tensor:
+    def recall(self, is_init: Tensor | None, cold: Tensor, age: Tensor | None = None) -> Tensor:
         """Return the last plan, shifted by the steps since, as the mean of the next one.
 
         Args:
             is_init: whether an episode starts, bool ``[*batch]``; ``None`` if unknown.
             cold: fills up the shifted plan, and replaces it at the start of an episode,
                 ``[*batch, H, m]``.
+            age: steps since the last plan of each row, ``[*batch]``, where they differ.
         """
         if self._plans is None or not self._fits(cold):
             return cold.contiguous()  # other strides would need another compiled graph
-        steps = min(self.replan_every + self._missed, cold.shape[-2])
-        mean = torch.cat([self._plans[..., steps:, :], cold[..., :steps, :]], -2)
+        horizon = cold.shape[-2]
+        if age is None:
+            steps = min(self.replan_every + self._missed, horizon)
+            mean = torch.cat([self._plans[..., steps:, :], cold[..., :steps, :]], -2)
+        else:
+            places = age[..., None, None] + torch.arange(horizon, device=age.device)[:, None]
+            later = self._plans.gather(-2, places.clamp_max(horizon - 1).expand_as(cold))
+            mean = torch.where(places < horizon, later, cold)
         return mean if is_init is None else torch.where(is_init[..., None, None], cold, mean)
 
     def remember(self, plans: Tensor) -> None:
@@ -103,19 +110,18 @@ class RecedingHorizon:
         """Keep an action ``[*batch, m]`` for :meth:`last_action`."""
         self._last = action
 
-    def follow(self, sent: Tensor) -> None:
+    def follow(self, sent: Tensor, missed: int = 0) -> None:
         """Go on after steps in which others acted.
 
         Args:
-            sent: the actions that were taken, ``[steps, *batch, m]``: the first in the place of the
-                last one recorded. Plans move up by the other steps.
+            sent: the action that was taken last, ``[*batch, m]``.
+            missed: steps, after the one in which it was planned last, by which plans move up.
         """
-        self.record(sent[-1])
-        missed = len(sent) - 1
-        if self._age is None:
-            self._missed += missed
-        else:
+        self.record(sent)
+        if self._age is not None:
             self._age = self._age + missed
+        elif self._plans is not None:
+            self._missed += missed
 
     def _fits(self, cold: Tensor) -> bool:
         plans = self._plans

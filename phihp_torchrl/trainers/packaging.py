@@ -39,13 +39,14 @@ class Packaging:
             Whether there is a package; where there is none a warning says why.
         """
         try:
-            packaged = self._work.wait(_PATIENCE)
-            if (package := self._work.package) is not None:
-                place_package(package, place)
+            self._work.wait(_PATIENCE)
+            if (package := self._work.package) is None:
+                return False
+            place_package(package, place)
         except (OSError, TimeoutError) as error:
             _log.warning("The agent has no package of its plan: %s", error)
             return False
-        return packaged
+        return True
 
 
 def packages_plan(context: Context, agent: Agent) -> bool:
@@ -76,6 +77,7 @@ def _is_importable(context: Context) -> bool:
 
 def _idle_cores(threads: int) -> float:
     """The cores that neither this process uses nor others did in the last minute."""
-    if not hasattr(os, "sched_getaffinity"):  # not on Linux, and then it is not known
+    try:
+        return len(os.sched_getaffinity(0)) - max(threads, os.getloadavg()[0])
+    except (AttributeError, OSError):  # it is not known, as anywhere but on Linux
         return 0.0
-    return len(os.sched_getaffinity(0)) - max(threads, os.getloadavg()[0])

@@ -280,9 +280,9 @@ class PolicySearch:
         self.over = True
         if self.stuck:
             _log.warning(
-                "Imagined returns stayed at the floor from many starts with %s. Check that the "
-                "reward can be reached: give the task a coverage box that holds the way to it and "
-                "a goal box around it, or a reward that grows on the way.",
+                "Imagined returns stayed at the floor from many starts with the best of %s. Check "
+                "that the reward can be reached: give the task a coverage box that holds the way "
+                "to it and a goal box around it, or a reward that grows on the way.",
                 [name for name, _ in self.ways[: self.tried + 1]],
             )
         elif self.tried:

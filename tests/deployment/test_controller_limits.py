@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from phihp_torchrl import Agent, Constraint, HybridDynamics, get_task
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.deployment import Controller, Safety
 from phihp_torchrl.planners import CEMConfig
-from phihp_torchrl.tasks import Disturbance, Signal
+from phihp_torchrl.tasks import Actuator, Disturbance, Signal
 
 from .agent_parts import SMALL, make_agent
 
@@ -127,3 +128,88 @@ def test_an_agent_that_was_overruled_goes_on_from_what_was_sent():
     control.step(UPRIGHT)
     assert np.isnan(began[0])
     assert began[1:] == [own, -2.0]
+
+
+def test_a_step_in_which_the_agent_failed_counts_as_missed():
+    agent, heard = make_agent(config=replace(SMALL, warm_start=True)), []
+    fails = iter([False, True, False])
+
+    class Failing(Agent):
+        def _plan(self, tensordict):
+            if next(fails):
+                raise RuntimeError("no")
+            return super()._plan(tensordict)
+
+        def follow(self, sent, missed=0):
+            heard.append((sent.item(), missed))
+
+    parts = {name: getattr(agent, name) for name in ("dynamics", "actor", "qvalue")}
+    failing = Failing(agent.task, **parts, planner_config=agent.planner_config)
+    control = Controller(failing, fallback=lambda o: [-2.0])
+    own = control.step(UPRIGHT).item()
+    for _ in range(2):
+        control.step(UPRIGHT)
+    assert heard == [(own, 0), (-2.0, 1)]
+
+
+def test_an_agent_of_ones_own_acts_by_its_own_forward():
+    task = replace(PENDULUM, name="pushed", disturbance=Disturbance(high={"theta_dot": 5.0}))
+
+    class Halved(Agent):
+        def forward(self, tensordict, tensordict_out=None):
+            acted = super().forward(tensordict, tensordict_out)
+            return acted.set("action", 0.0 * acted["action"] + 0.125)
+
+    agent = Halved(task, dynamics=HybridDynamics.pure_prior(task), actor=Actor(task))
+    assert Controller(agent).step(UPRIGHT).item() == 0.125
+
+
+def test_an_agent_completes_what_its_controller_does_not_know_of():
+    task = replace(PENDULUM, name="late", actuator=Actuator(delay_steps=1.0))
+    control = Controller(Agent(task, actor=Actor(task)), task="pendulum", fallback="zero")
+    control.step(UPRIGHT)
+    assert control.report().reasons == {}
+
+
+@pytest.mark.parametrize("lost", ["reference", "observation"])
+def test_what_is_sent_before_the_first_step_of_the_agent_is_under_way(lost):
+    signal = Signal(("theta",), (-1.0,), (1.0,))
+    changes = {"reward": distance, "reference": signal, "actuator": Actuator(delay_steps=1.0)}
+    task, seen = replace(PENDULUM, name="late-tracked", **changes), []
+
+    def act(observation):
+        seen.append(observation.tolist())
+        return torch.ones(1)
+
+    control = Controller(policy(act), task, fallback=lambda o: [1.5])
+    if lost == "reference":
+        control.step(UPRIGHT, reference=[float("nan")])
+    else:
+        control.step(LOST, reference=[0.25])
+    control.step(UPRIGHT, reference=[0.5])
+    assert sorted(seen[0][3:]) == near([0.5, 0.75])  # in half-ranges
+
+
+def test_an_agent_that_is_late_at_first_is_told_what_was_sent():
+    begun, waits, told = [], threading.Event(), []
+
+    class Slow(TensorDictModule):
+        def follow(self, sent, missed=0):
+            told.append((sent.item(), missed))
+
+    def act(observation, is_init):
+        begun.append(is_init.item())
+        if len(begun) == 1:
+            waits.wait(20)
+        return torch.ones(1)
+
+    agent = Slow(act, ["observation", "is_init"], ["action"])
+    control = Controller(agent, PENDULUM, safety=Safety(deadline=0.2), fallback=lambda o: [0.5])
+    sent = [control.step(UPRIGHT).item() for _ in range(2)]
+    waits.set()
+    control._worker._running.result(20)
+    sent.append(control.step(UPRIGHT).item())
+    control.close()
+    assert sent == [0.5, 0.5, 1.0]
+    assert begun == [True, False]
+    assert told == [(0.5, 1)]

@@ -141,9 +141,9 @@ def test_an_exported_plan_goes_on_from_the_one_before_as_the_planner_does(config
         for k, seen in enumerate(observations(agent, 6)):
             starts = torch.tensor([k in (0, 4)])
             if k == 2:  # others have acted meanwhile
-                sent = torch.full((3, 1), agent.task.action_high[0])
-                agent.follow(sent)
-                exported.follow(sent)
+                sent = torch.tensor(agent.task.action_high)
+                agent.follow(sent, missed=2)
+                exported.follow(sent, missed=2)
             actions = []
             for each in (agent, exported):
                 torch.manual_seed(k)

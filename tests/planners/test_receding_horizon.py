@@ -69,9 +69,10 @@ def test_plans_move_up_by_the_steps_in_which_others_acted(monkeypatch):
     _, env, _, _ = task_parts("pendulum")
     planner = make_planner(env, warm_start=True)
     means = scripted(planner, monkeypatch)
-    data, sent = TensorDict(batch_size=[]), torch.tensor([[0.5], [0.25], [2.0]])
+    data = TensorDict(batch_size=[])
+    planner.receding.follow(torch.tensor([0.5]), missed=7)  # there is no plan yet
     planner.planning(data)
-    planner.receding.follow(sent)
+    planner.receding.follow(torch.tensor([2.0]), missed=2)
     assert planner.receding.last_action(None, torch.zeros(1)) == 2.0
     for _ in range(2):
         planner.planning(data)
@@ -85,8 +86,20 @@ def test_a_plan_of_several_steps_is_over_earlier_where_others_acted(monkeypatch)
     scripted(planner, monkeypatch)
     data = TensorDict(batch_size=[])
     planner.planning(data)
-    planner.receding.follow(torch.zeros(2, 1))
+    planner.receding.follow(torch.zeros(1), missed=1)
     assert [planner.planning(data).item() for _ in range(2)] == [2, 10]
+
+
+def test_a_warm_plan_of_several_steps_moves_up_by_all_that_went_by(monkeypatch):
+    _, env, _, _ = task_parts("pendulum")
+    planner = make_planner(env, replan_every=2, warm_start=True)
+    means = scripted(planner, monkeypatch)
+    data = TensorDict(batch_size=[2])
+    planner.receding.follow(torch.zeros(2, 1), missed=5)  # there is no plan yet
+    planner.planning(data)
+    planner.receding.follow(torch.zeros(2, 1), missed=2)
+    planner.planning(data)
+    assert means[1].flatten().tolist() == [3, 0, 0, 0] * 2
 
 
 def test_a_warm_start_remembers():
