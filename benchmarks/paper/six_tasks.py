@@ -5,8 +5,8 @@ r"""What a user of the defaults gets on the six tasks: returns, smoothness, and 
     python benchmarks/paper/six_tasks.py
 
 Reads the kept runs of default settings with training seeds from 100 on, and writes
-results/six_tasks/README.md beside them; the runs in results/runs are of version 0.1.0. It runs
-nothing and chooses nothing. Means are over training seeds, and so are their intervals: episodes of
+results/six_tasks/README.md beside them, and the first columns into README.md; the runs in
+results/runs are of version 0.1.0. It runs nothing and chooses nothing. Means are over training seeds, and so are their intervals: episodes of
 one seed share their agent, so that a seed counts once.
 """
 
@@ -20,12 +20,15 @@ from pathlib import Path
 
 from measures import agent_in, paired_difference_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, markdown_table
+from report.overview import origins, put_between
 from report.runs import Run, read_runs
 
 RESULTS = Path("results/six_tasks")
 TASKS = ("pendulum", "pendulum-swingup", "cartpole", "cartpole-swingup", "acrobot",
          "acrobot-swingup")  # fmt: skip
 FIRST_SEED = 100
+START, END = "<!-- six-tasks:start -->", "<!-- six-tasks:end -->"
+"""Between these README.md has its table."""
 AIMS = {
     "pendulum": -183.6,
     "pendulum-swingup": -345.9,
@@ -126,6 +129,25 @@ def page(runs: Sequence[Run]) -> str:
     )
 
 
+def brief(runs: Sequence[Run]) -> str:
+    """What somebody new wants to know first, for README.md."""
+    header = ["task", "seeds", "real steps", "return", "chatter", "paper", "paper's steps"]
+    rows, used = [], []
+    for task in TASKS:
+        if not (those := ours(runs, task)):
+            continue
+        used += those
+        name, count, steps, agent, _, _, calm, *_ = row(task, those)
+        theirs = PUBLISHED.get(task, {}).get("PhIHP")
+        paper = ["–", "–"]
+        if theirs is not None:
+            assert theirs.samples is not None  # PhIHP's are known
+            mean, std = theirs.return_mean, theirs.return_std
+            paper = [f"{mean:g} ± {std:g}", f"{1000 * theirs.samples:,.0f}"]
+        rows.append([name, count, steps, agent, calm.split(" ")[0], *paper])
+    return f"{markdown_table(header, rows)}\n{origins(used)}"
+
+
 def main() -> None:
     """Read and write."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -136,6 +158,7 @@ def main() -> None:
         parser.exit(1, f"{results}: expected default runs of seeds from {FIRST_SEED} on.\n")
     text = page(runs)
     (results / "README.md").write_text(text)
+    put_between(Path("README.md"), START, END, brief(runs))
     print(text)
 
 

@@ -63,12 +63,15 @@ def fill_page(page: Path, runs: Sequence[Run]) -> bool:
         page: the page, such as a README.
         runs: the runs with one label.
     """
-    text = page.read_text() if page.is_file() else ""
-    if START not in text or END not in text.split(START)[1]:
-        return False
-    before, rest = text.split(START, 1)
     used = [run for run in runs if run.method == "phihp"]
-    page.write_text(
-        f"{before}{START}\n{returns_markdown(used)}\n{origins(used)}\n{END}{rest.split(END, 1)[1]}"
-    )
+    return put_between(page, START, END, f"{returns_markdown(used)}\n{origins(used)}")
+
+
+def put_between(page: Path, start: str, end: str, text: str) -> bool:
+    """Put a text between two markers of a page; whether it has them."""
+    old = page.read_text() if page.is_file() else ""
+    if start not in old or end not in old.split(start)[1]:
+        return False
+    before, rest = old.split(start, 1)
+    page.write_text(f"{before}{start}\n{text}\n{end}{rest.split(end, 1)[1]}")
     return True
