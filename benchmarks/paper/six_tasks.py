@@ -6,8 +6,9 @@ r"""What a user of the defaults gets on the six tasks: returns, smoothness, and 
 
 Reads the kept runs of default settings with training seeds from 100 on, and writes
 results/six_tasks/README.md beside them, and the first columns into README.md; the runs in
-results/runs are of version 0.1.0. It runs nothing and chooses nothing. Means are over training seeds, and so are their intervals: episodes of
-one seed share their agent, so that a seed counts once.
+results/runs are of version 0.1.0. It runs nothing and chooses nothing. Means are over training
+seeds, and so are their intervals: episodes of one seed share their agent, so that a seed counts
+once.
 """
 
 from __future__ import annotations
