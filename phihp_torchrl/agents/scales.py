@@ -137,6 +137,12 @@ class _PreparedScaled(_InUnits, PreparedModel):
         self.center, self.scale = model.center, model.scale
         self.reward_scale = model.reward_scale
 
+    def judge(
+        self, state: Tensor, command: Tensor, next_state: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        reward, ended = super().judge(state, command, next_state)
+        return reward / self.reward_scale, ended
+
 
 def scaled(model: TaskWorldModel, scales: Scales) -> TaskWorldModel:
     """Return the model in these units, which is the model itself where they change nothing."""

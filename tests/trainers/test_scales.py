@@ -160,6 +160,9 @@ def test_rollouts_in_units_are_the_same_prepared():
             torch.testing.assert_close(one, other)
         seen = model.observe(state)
         torch.testing.assert_close(model.prepared().observe(state), seen)
+        command, following = model.prepared().advance(state, action)
+        reward, _ = model.prepared().judge(state, command, following)
+        torch.testing.assert_close(reward, found.reward)
         torch.testing.assert_close(model.prepared().locate(seen), state)
 
     class Otherwise(type(model)):
