@@ -159,7 +159,8 @@ def main() -> None:
         parser.exit(1, f"{results}: expected default runs of seeds from {FIRST_SEED} on.\n")
     text = page(runs)
     (results / "README.md").write_text(text)
-    put_between(Path("README.md"), START, END, brief(runs))
+    if results == RESULTS:  # and not others' runs
+        put_between(Path("README.md"), START, END, brief(runs))
     print(text)
 
 

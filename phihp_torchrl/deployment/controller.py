@@ -132,7 +132,8 @@ class Controller:
             inputs: further entries that the agent reads, by key.
 
         Raises:
-            ValueError: for an observation of the wrong size.
+            ValueError: for an observation of the wrong size, and for a reference or inputs of the
+                task that are missing where an episode starts, or of another shape.
         """
         with self._lock, torch.no_grad():
             started = self._clock()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from phihp_torchrl.config import ConfigError, check_count, check_positive
-from phihp_torchrl.tasks import Task
+from phihp_torchrl.tasks import LastAction, Task
 from phihp_torchrl.worlds import read_guards
 
 REASONS = {
@@ -126,16 +126,11 @@ class Checks:
                 f"got {change!r}.",
             )
         self.change = None if change is None else torch.tensor(change).expand(task.action_dim)
-        rate = task.action_rate_limit
-        self._rate = None
-        if rate is not None:
-            self._rate = task.time_step * torch.tensor(rate).expand(task.action_dim)
+        self._rate = LastAction(task.bounds, rate_limit=task.action_rate_limit, cost=0.0)
 
     def command(self, action: Tensor, last: Tensor) -> Tensor:
         """The command for an action ``[m]``: in the task's bounds, and within its rate."""
-        if self._rate is not None:
-            action = torch.clamp(action, last - self._rate, last + self._rate)
-        return self.task.clip_action(action)
+        return self._rate.limit(last, self.task.clip_action(action), self.task.time_step)
 
     def observation(self, observation: Tensor) -> str | None:
         """Why an observation ``[o]`` on the CPU cannot be acted upon, or ``None``."""

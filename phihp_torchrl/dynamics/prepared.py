@@ -114,6 +114,23 @@ class PreparedModel:
         reward, ended = self.task.judge(state, command, next_state)
         return reward, ended if self.task.may_end else None
 
+    def judge_path(self, path: Tensor, commands: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Judge all steps of paths together.
+
+        Args:
+            path: states before each step, and after the last, ``[H + 1, rows, n]``.
+            commands: the commands of the steps, ``[H * rows, m]``.
+
+        Returns:
+            Rewards ``[H, rows]``, and whether a path has ended by then, bool ``[H, rows]``;
+            ``None`` where nothing can end.
+        """
+        shape = len(path) - 1, path.shape[1]
+        before, after = path[:-1].flatten(0, 1), path[1:].flatten(0, 1)
+        reward, ended = self.judge(before, commands, after)
+        gone = None if ended is None else ended.view(shape).cumsum(0) > 0
+        return reward.view(shape), gone
+
     def _make_step(self, dynamics: nn.Module, like: Tensor) -> Derivative:
         if not isinstance(dynamics, HybridDynamics):
             return dynamics

@@ -17,7 +17,7 @@ ACTIVATIONS = MappingProxyType(
     {kind.__name__: kind for kind in (nn.ReLU, nn.Tanh, nn.SiLU, nn.ELU, nn.GELU, nn.Softplus)}
 )
 """Activations of a residual, by the name of their class."""
-# Those that are faster to call as functions.
+# Those that are faster to call as functions; a tanh is a sigmoid between changed layers.
 _FUNCTIONS: dict[type[nn.Module], Any] = {nn.ReLU: torch.relu, nn.Tanh: torch.sigmoid}
 
 

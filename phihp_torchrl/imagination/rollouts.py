@@ -201,7 +201,8 @@ def sum_rewards_at_once(
 ) -> Returns:
     """As :func:`sum_rewards`, up to rounding, with the rewards and ends of all steps together.
 
-    An actor's evaluation, a few rows for hundreds of steps, then has half of the operations.
+    An actor's evaluation, 64 rows for hundreds of steps, then takes less than half of the time
+    (``results/benchmarks``).
     """
     state, total, weight, last, change = returns
     states, actions, commands = [state], [last], []
@@ -212,17 +213,14 @@ def sum_rewards_at_once(
         actions.append(action)
         commands.append(command)
     path, taken = torch.stack(states), torch.stack(actions)
-    before, after = path[:-1].flatten(0, 1), path[1:].flatten(0, 1)
-    reward, ended = world_model.judge(before, torch.cat(commands), after)
+    reward, gone = world_model.judge_path(path, torch.cat(commands))
     running = (weight != 0).expand(steps, -1)
-    if ended is not None:
-        gone = ended.view(steps, -1).cumsum(0) > 0
+    after = weight * gamma**steps
+    if gone is not None:
         running = running & ~torch.cat([torch.zeros_like(gone[:1]), gone[:-1]])
-        weight_after = weight.masked_fill(gone[-1], 0.0)
-    else:
-        weight_after = weight
+        after = after.masked_fill(gone[-1], 0.0)
     discounts = gamma ** torch.arange(steps, device=state.device).unsqueeze(-1)
-    earned = (weight * discounts * reward.view(steps, -1)).masked_fill(~running, 0.0)
+    earned = (weight * discounts * reward).masked_fill(~running, 0.0)
     # A limit that no comparison with NaN exceeds would else be kept for ever.
     lost = (running & ~path[1:].isfinite().all(-1)).any(0)
     moved = (taken.diff(dim=0).abs() / bounds.scale).mean(-1)
@@ -230,7 +228,7 @@ def sum_rewards_at_once(
     return Returns(
         state,
         (total + earned.sum(0)).masked_fill(lost, math.nan),
-        weight_after * gamma**steps,
+        after,
         action,
         change + moved.sum(0),
     )
@@ -262,7 +260,7 @@ class Rollouts:
 
     # Steps of a compiled piece of a return: enough that its call is cheap, few enough to compile.
     _RETURN_STEPS = 5
-    # Rows of which rewards are computed together, of all steps: they should stay in the cache.
+    # Rows of which rewards are computed together, of all steps: a bound of their memory.
     _ROWS_AT_ONCE = 65_536
 
     def __init__(
@@ -290,7 +288,7 @@ class Rollouts:
         self, weights: Sequence[Tensor], worlds: Worlds, noise: ChunkNoise
     ) -> tuple[Batch, Worlds]:
         """Step all worlds through a chunk: :func:`step_worlds`."""
-        step, _ = self._compiled or self._eager()
+        step, _ = self._compiled or (partial(step_worlds, self._model(), self.policy), None)
         return step(weights, worlds, noise, self.bounds, self.max_age)
 
     def returns(
@@ -311,11 +309,9 @@ class Rollouts:
             signals: references and inputs after each step, registers ``[steps, N, size]``. By
                 default they go on as the model expects.
         """
-        _, eager = self._eager()
-        _, piece = self._compiled or (None, eager)
+        model = self._model()
         returns, size = Returns.from_state(state, self.bounds), self._RETURN_STEPS
-        model = None if self._compiled or signals is not None else self._model()
-        if isinstance(model, PreparedModel):
+        if isinstance(model, PreparedModel) and not self._compiled and signals is None:
             size = max(1, self._ROWS_AT_ONCE // max(1, len(state)))
             for first in range(0, steps, size):
                 length = min(size, steps - first)
@@ -323,6 +319,8 @@ class Rollouts:
                     model, self.policy, weights, returns, self.bounds, length, gamma
                 )
             return returns
+        eager = partial(sum_rewards, model, self.policy)
+        _, piece = self._compiled or (None, eager)
         whole = steps - steps % size
         for first in range(0, whole, size):
             after = None if signals is None else signals[first : first + size]
@@ -330,11 +328,6 @@ class Rollouts:
         after = None if signals is None else signals[whole:]
         return eager(weights, returns, self.bounds, steps % size, gamma, after)
 
-    def _eager(self) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Both functions with the weights that the model has now, in as few operations."""
-        model = self._model()
-        step, sum_up = (partial(f, model, self.policy) for f in (step_worlds, sum_rewards))
-        return step, sum_up
-
     def _model(self) -> TaskWorldModel | PreparedModel:
+        """The model with the weights that it has now, in as few operations as it can be."""
         return self.world_model if torch.is_grad_enabled() else self.world_model.prepared()

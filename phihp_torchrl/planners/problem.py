@@ -119,7 +119,7 @@ def score_sequences(
     if problem.judge is not None:
         scores = problem.judge(state, actions)
         return torch.nan_to_num(scores, *(float("-inf"),) * 3), actions
-    roll_out: Callable[..., RolledOut] = at_once if hasattr(model, "judge") else step_by_step
+    roll_out: Callable[..., RolledOut] = at_once if hasattr(model, "judge_path") else step_by_step
     guide = None
     if actor is not None and (policy_noise is not None or completed):
         guide = Guide(problem.bounds, actor, policy_noise, completed)

@@ -240,7 +240,7 @@ def at_once(
     Args:
         state: as for :func:`step_by_step`.
         actions: as for :func:`step_by_step`.
-        model: a model with ``commands``, ``advance`` and ``judge``.
+        model: a model with ``commands``, ``advance`` and ``judge_path``.
         guide: as for :func:`step_by_step`.
         prices: as for :func:`step_by_step`.
     """
@@ -254,16 +254,13 @@ def at_once(
         states.append(state)
         commands.append(command)
     actions = torch.stack(taken) if taken else actions
-    path, shape = torch.stack(states), actions.shape[:2]
-    before, after = path[:-1].flatten(0, 1), path[1:].flatten(0, 1)
-    reward, ended = model.judge(before, torch.cat(commands), after)
-    reward = reward.view(shape)
+    path = torch.stack(states)
+    reward, gone = model.judge_path(path, torch.cat(commands))
     if prices.change_cost:
         first = actions[0] if prices.last is None else prices.last
         reward = reward - prices.of(actions, torch.cat([first[None], actions[:-1]]))
     over, bad = None, ~path[1:].isfinite().all(-1)
-    if ended is not None:
-        gone = ended.view(shape).cumsum(0) > 0
+    if gone is not None:
         over = gone[-1]
         bad = torch.cat([bad[:1], bad[1:] & ~gone[:-1]])
         reward = torch.cat([reward[:1], reward[1:].masked_fill(gone[:-1], 0.0)])

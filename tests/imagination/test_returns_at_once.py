@@ -63,8 +63,8 @@ def test_pieces_are_as_long_as_fits_the_cache(monkeypatch):
     rollouts = Rollouts(model, act, max_age=100)
     with torch.no_grad():
         whole = rollouts.returns(weights, state, steps=23)
-        monkeypatch.setattr(Rollouts, "_ROWS_AT_ONCE", 5 * len(state))
-        for ours, theirs in zip(rollouts.returns(weights, state, steps=23), whole, strict=True):
-            torch.testing.assert_close(ours, theirs)
-        monkeypatch.setattr(Rollouts, "_ROWS_AT_ONCE", 1)
-        rollouts.returns(weights, state, steps=2)
+        for rows in (5 * len(state), 1):
+            monkeypatch.setattr(Rollouts, "_ROWS_AT_ONCE", rows)
+            found = rollouts.returns(weights, state, steps=23)
+            for ours, theirs in zip(found, whole, strict=True):
+                torch.testing.assert_close(ours, theirs)

@@ -56,3 +56,6 @@ def test_time_to_the_published_return_is_that_of_the_first_actor_to_earn_it(tmp_
     page = six_tasks.page([run])
     assert "Training seeds 100." in page
     assert "Not run yet: pendulum-swingup" in page
+    first = six_tasks.brief([run]).splitlines()[2]
+    assert first.startswith("| pendulum | 1 | ")
+    assert first.endswith("| -263 ± 144 | 2,000 |")
