@@ -15,6 +15,9 @@ from phihp_torchrl.trainers.files import write_atomically
 
 _log = logging.getLogger(__name__)
 
+# Standard errors beyond which a difference is no chance; that few episodes were played remains.
+_CLEAR = 4.0
+
 
 def summary(choice: Choice, ways: Mapping[str, Way], actor: Way) -> dict[str, Any]:
     """The record of a choice, in plain values."""
@@ -59,13 +62,19 @@ def report(final: Mapping[str, Any]) -> None:
         final["actor_chatter"],
         final["acting"],
     )
-    if not final["certain"]:
-        _log.warning(
-            "Whether the plan or the actor earns more is in doubt after %d imagined episodes; the "
-            "%s acts. Raise calibrate.max_episodes and calibrate.budget to know better.",
-            final["episodes"],
-            final["acting"],
-        )
+    if final["certain"]:
+        return
+    if abs(final["gain"]) > _CLEAR * final["gain_error"]:
+        found = "One of plan and actor earns clearly more, but a rare failure may be missed in"
+    else:
+        found = "Whether the plan or the actor earns more is in doubt after"
+    _log.warning(
+        "%s %d imagined episodes; the %s acts. Raise calibrate.max_episodes and calibrate.budget "
+        "to know better.",
+        found,
+        final["episodes"],
+        final["acting"],
+    )
 
 
 def write_table(path: Path, final: Mapping[str, Any], planner: SearchConfig) -> None:

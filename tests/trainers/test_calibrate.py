@@ -20,7 +20,8 @@ from phihp_torchrl.trainers import (
     run,
 )
 from phihp_torchrl.trainers import calibrate as calibrate_module
-from phihp_torchrl.trainers.calibrate_rule import Choice
+from phihp_torchrl.trainers.calibrate_report import report, summary
+from phihp_torchrl.trainers.calibrate_rule import Choice, Way
 from phihp_torchrl.trainers.imagined_play import play
 
 from .calibrate_parts import SMALL, TINY, finished, make_agent
@@ -220,3 +221,14 @@ def test_a_run_calibrates_before_it_evaluates(tmp_path):
     evaluated = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert ("planner" in evaluated) == (table["acting"] == "planner")
     assert result.metrics["calibrate/acting_planner"] == float(table["acting"] == "planner")
+
+
+@pytest.mark.parametrize(
+    ("gain_error", "words"), [(5.0, "a rare failure may be missed in 6"), (300.0, "is in doubt")]
+)
+def test_a_doubt_says_which_it_is(gain_error, words, caplog):
+    ways = {"given": Way((400.0, 500.0), (0.1, 0.1))}
+    choice = Choice("given", "planner", False, 450.0, gain_error)
+    report(summary(choice, ways, Way((0.0,) * 6, (0.1,) * 6)))
+    assert words in caplog.text
+    assert "planner acts" in caplog.text
