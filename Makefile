@@ -17,7 +17,7 @@ HEADLESS := SDL_VIDEODRIVER=dummy MPLBACKEND=Agg WANDB_MODE=disabled
 # Whatever the shell says: each of the processes of the tests would compile all modules anew.
 KEEP_BYTECODE := PYTHONDONTWRITEBYTECODE=
 
-.PHONY: help demo test lint format types config docs bench lock clean
+.PHONY: help demo test lint format types config docs bench report lock clean
 
 help: ## print these targets
 	@grep -hE '^[a-z]+:.*## ' Makefile | sed -E 's/^([a-z]+):.*## /  make \1\t/' | expand -t 16
@@ -52,6 +52,11 @@ docs: $(DOCS_STAMP) ## build the documentation into site/
 
 bench: $(STAMP) ## time the hot paths (benchmarks/speed/)
 	$(ONE_THREAD) $(HEADLESS) $(BIN)/python -m pytest benchmarks/speed --benchmark-only $(ARGS)
+
+report: $(STAMP) ## make results/report and the README's tables again from the runs that are kept
+	$(PIP) -e ".[report]"
+	$(ONE_THREAD) $(HEADLESS) $(BIN)/python benchmarks/paper/make_report.py any_version=true $(ARGS)
+	$(ONE_THREAD) PYTHONPATH=. $(BIN)/python benchmarks/paper/six_tasks.py
 
 lock: $(STAMP) ## write requirements.lock and sbom.json for this platform (asks the package index)
 	$(BIN)/python .ci/lock.py

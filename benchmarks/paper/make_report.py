@@ -28,9 +28,9 @@ def main(composed: DictConfig) -> None:
     try:
         logger = from_mapping(LoggerConfig, mapping.pop("logger"), "logger")
         config = from_mapping(ReportConfig, mapping)
+        report = make_report(config)
     except ConfigError as error:
         sys.exit(f"error: {error}")
-    report = make_report(config)
     for problem in report.problems:
         print(problem)
     log(report, config, logger)

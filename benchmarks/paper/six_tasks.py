@@ -18,6 +18,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from statistics import median
 
 from measures import agent_in, paired_difference_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, markdown_table
@@ -63,10 +64,15 @@ def seconds_until(run: Run, level: float) -> float:
 
 
 def times(runs: Sequence[Run], level: float) -> str:
-    """The mean of these seconds over the runs that got there, and how many did, if not all."""
-    reached = [t for run in runs if (t := seconds_until(run, level)) < math.inf]
-    mean = f"{sum(reached) / len(reached):.0f}" if reached else "–"
-    return mean if len(reached) == len(runs) else f"{mean} ({len(reached)} of {len(runs)})"
+    """The median of these seconds, and how many runs got there, if not all.
+
+    A run that never did took longer than any; a mean over the others would flatter.
+    """
+    needed = [seconds_until(run, level) for run in runs]
+    reached = sum(seconds < math.inf for seconds in needed)
+    middle = median(needed)
+    text = f"{middle:.0f}" if middle < math.inf else "–"
+    return text if reached == len(runs) else f"{text} ({reached} of {len(runs)})"
 
 
 def spread(values: Sequence[float], digits: int) -> str:
@@ -109,6 +115,9 @@ def page(runs: Sequence[Run]) -> str:
     rows = [row(task, those) for task, those in found.items() if those]
     missing = [task for task, those in found.items() if not those]
     seeds = ", ".join(str(seed) for seed in sorted({run.seed for run in used}))
+    for task, those in found.items():
+        if len({run.configuration for run in those}) > 1:
+            raise ValueError(f"{task}: expected runs of one configuration, got several.")
     commits = ", ".join(sorted({run.commit for run in used}))
     machines = "; ".join(sorted({run.machine for run in used}))
     return (
@@ -119,8 +128,8 @@ def page(runs: Sequence[Run]) -> str:
         "the action from step to step in the second half of an episode, in half-ranges. *aim* is "
         "the return of version 0.1.0. *s to published* are the seconds of a run, its real steps "
         "and the fits of its model among them, until the actor first earned the published mean "
-        "return of PhIHP in ten episodes of the world, a mean over the runs in which it did (how "
-        "many, if not all); *s in all* has "
+        "return of PhIHP in ten episodes of the world: the median over the runs, those that never "
+        "did among them as longer than any (how many did, if not all); *s in all* has "
         "calibration and the evaluation of 50 episodes too. Brackets are 95 % intervals over "
         "training seeds.\n\n"
         f"{markdown_table(header, rows)}\n"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from phihp_torchrl.config import check_count
+from phihp_torchrl.config import ConfigError, check_count
 from phihp_torchrl.trainers import import_plugins
 from report.ablation import ablation
 from report.claims import claims_section
@@ -24,6 +25,8 @@ from report.significance import significance
 from report.soundness import soundness
 from report.time_to_return import time_to_return
 from report.write import write_report
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -77,11 +80,21 @@ def make_report(config: ReportConfig) -> Report:
 
     Args:
         config: from where and to where.
+
+    Raises:
+        ConfigError: where folders of runs are there, and none of them can be read; nothing is
+            written then, so that no report is replaced by an empty one.
     """
     import_plugins(config.plugins)
     folders = read_runs(Path(config.runs), any_version=config.any_version)
     trials, unread = read_trials(Path(config.sensitivity))
     problems = [*folders.problems, *unread]
+    if not folders.runs and any(path.is_dir() for path in Path(config.runs).glob("*")):
+        raise ConfigError(
+            "runs",
+            f"expected finished runs in {config.runs}, could read none of "
+            f"{len(folders.problems)}; the first says: {folders.problems[0]}",
+        )
     chosen = [run for run in folders.runs if run.label == config.label]
     results = Results(chosen)
     sections = [
@@ -122,8 +135,9 @@ def _make(title: str, make: Callable[[], Section], problems: list[str]) -> Secti
     """A section, or a word on why it could not be made."""
     try:
         return make()
-    except ImportError as error:  # of the extra `report`
-        problems.append(f"{title}: not made: {error}")
+    except Exception as error:  # one part that fails, such as one of an extra, costs no other
+        _log.warning("%s: not made.", title, exc_info=not isinstance(error, ImportError))
+        problems.append(f"{title}: not made: {type(error).__name__}: {error}")
         return Section(title, f"Not made: {error}")
 
 

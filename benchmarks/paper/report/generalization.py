@@ -23,8 +23,14 @@ def generalization(results: Results) -> Section:
     }
     rows: list[list[TableCell]] = []
     for (task, kind), runs in groups.items():
-        errors = tuple(run.prediction[_ERROR] for run in runs)
-        rows.append([f"{task}, {KINDS[kind]}", Stat(errors, 5), Stat(tuple(map(final, runs)))])
+        cells = sorted({(run.method, run.samples) for run in runs})
+        for method, samples in cells or [("–", 0)]:
+            these = [run for run in runs if (run.method, run.samples) == (method, samples)]
+            errors = tuple(run.prediction[_ERROR] for run in these)
+            returns = tuple(map(final, these))
+            name = f"{task}, {KINDS[kind]}"
+            rows.append([name, method, f"{samples:,}", Stat(errors, 5), Stat(returns)])
+    header = ["task, model", "method", "real samples", "error", "return"]
     columns = 4
     lines = -(-len(results.tasks) // columns)
     figure = Figure(figsize=(13.6, 2.8 * lines), layout="constrained")
@@ -46,9 +52,9 @@ def generalization(results: Results) -> Section:
         "Generalization",
         f"Median distance between true and predicted state after {PREDICTION_STEPS} steps, from "
         "states of the task's wide box under random actions of evaluation seeds, against the "
-        "return of the same run: planner if it has one, else actor. Runs with all numbers of real "
-        "samples.",
-        {"Error and return": Table("generalization", ["task, model", "error", "return"], rows)},
+        "return of the same run: planner if it has one, else actor. The figure has the runs with "
+        "all numbers of real samples; in the table a training seed counts once in a row.",
+        {"Error and return": Table("generalization", header, rows)},
         [Picture("generalization", figure, "Prediction error on unseen states against return.")],
     )
 

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 
+import pytest
 from kept_runs import make_run
 
 import six_tasks
@@ -52,7 +53,12 @@ def test_time_to_the_published_return_is_that_of_the_first_actor_to_earn_it(tmp_
     assert six_tasks.seconds_until(evaluated, -100.0) == math.inf, "the final evaluation is none"
     assert six_tasks.times([run], -263.0) == "1"
     make_run(tmp_path, seed=101, curve=curve[:1])
-    assert six_tasks.times(read_runs(tmp_path).runs, -263.0) == "1 (1 of 2)"
+    assert six_tasks.times(read_runs(tmp_path).runs, -263.0) == "– (1 of 2)", "half did not"
+    make_run(tmp_path, seed=102, curve=curve)
+    runs = read_runs(tmp_path).runs
+    assert six_tasks.times(runs, -263.0) == "1 (2 of 3)", "the median, not a mean of those who did"
+    with pytest.raises(ValueError, match="pendulum: expected runs of one configuration"):
+        six_tasks.page([run, replace(runs[1], configuration="another")])
     page = six_tasks.page([run])
     assert "Training seeds 100." in page
     assert "Not run yet: pendulum-swingup" in page

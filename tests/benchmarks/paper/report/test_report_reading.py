@@ -10,8 +10,10 @@ import pytest
 from grid_cells import ROOT
 from kept_runs import VERSION, make, make_run, table, text
 
+from phihp_torchrl.config import ConfigError
 from report import (
     NOT_RUN,
+    build,
     read_run,
     read_runs,
 )
@@ -85,6 +87,24 @@ def test_every_unfit_folder_is_named_and_the_rest_is_reported(tmp_path: Path) ->
     assert all(problem in page for problem in made.problems)
     assert table(tmp_path, "main_return")[0]["PhIHP seeds"] == "1"
     assert len(make(tmp_path, any_version=True).problems) == 6
+
+
+def test_where_no_folder_can_be_read_the_old_report_stays(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "runs")
+    make(tmp_path)
+    before = (tmp_path / "report" / "README.md").read_text()
+    (folder / "evaluation.json").unlink()
+    with pytest.raises(ConfigError, match=r"runs: .*evaluation.json is missing"):
+        make(tmp_path)
+    assert (tmp_path / "report" / "README.md").read_text() == before
+
+
+def test_a_part_that_fails_costs_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_run(tmp_path / "runs")
+    monkeypatch.setattr(build, "significance", lambda results: 1 / 0)
+    (problem,) = make(tmp_path).problems
+    assert "PhIHP against each baseline: not made: ZeroDivisionError" in problem
+    assert table(tmp_path, "main_return")
 
 
 @pytest.mark.parametrize("exists", [True, False])
