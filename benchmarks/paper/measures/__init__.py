@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from measures.acting import agent_in
-from measures.censored import Between, mean_between, ratio_between
+from measures.censored import Between, mean_between, ratio_between, ratio_interval
 from measures.configuration import configuration_hash
 from measures.curve import CurvePoint, curve_from_metrics, read_curve, write_curve
 from measures.differences import (
@@ -45,6 +45,7 @@ __all__ = [
     "paired_difference_of_seeds",
     "prediction_errors",
     "ratio_between",
+    "ratio_interval",
     "read_curve",
     "unseen_episodes",
     "write_curve",

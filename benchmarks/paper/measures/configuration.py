@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
-# What may differ between runs of one configuration: place, seed, and what is shown.
-_FREE = ("seed", "run_dir", "resume", "logger", "progress", "video", "plugins")
+# What may differ between runs of one configuration: place, seed, and what is shown. Only these
+# settings themselves are free: one of the same name in another section is a setting like any other.
+_FREE = ("seed", "run_dir", "resume", "logger", "progress", "plugins")
+_FREE_IN = {"evaluate": ("video",)}
 
 
 def configuration_hash(settings: Mapping[str, Any]) -> str:
@@ -24,12 +26,24 @@ def configuration_hash(settings: Mapping[str, Any]) -> str:
         True
         >>> configuration_hash(one) == configuration_hash({**one, "policy": {"updates": 9}})
         False
+        >>> worlds = ({"world": {"seed": 1}}, {"world": {"seed": 9}})
+        >>> len({configuration_hash(world) for world in worlds})
+        2
     """
-    text = json.dumps(_kept(settings), sort_keys=True, separators=(",", ":"))
+    kept = _without(settings, _FREE)
+    for section, free in _FREE_IN.items():
+        if isinstance(kept.get(section), Mapping):
+            kept[section] = _without(kept[section], free)
+    text = json.dumps(_plain(kept), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _kept(value: Any) -> Any:
+def _without(settings: Mapping[str, Any], free: Collection[str]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if key not in free}
+
+
+def _plain(value: Any) -> Any:
+    """The value as JSON has it, whatever kinds of mapping and sequence it is made of."""
     if isinstance(value, Mapping):
-        return {str(key): _kept(part) for key, part in value.items() if key not in _FREE}
-    return [_kept(part) for part in value] if isinstance(value, (list, tuple)) else value
+        return {str(key): _plain(part) for key, part in value.items()}
+    return [_plain(part) for part in value] if isinstance(value, (list, tuple)) else value

@@ -18,10 +18,12 @@ class Difference:
 
     Args:
         mean: the difference.
-        low: lower end of its 95 % interval; NaN where values are too few or do not vary.
+        low: lower end of its 95 % interval; NaN with fewer than two values on either side, and
+            where no value varies.
         high: upper end.
         p: two-sided p-value; NaN with fewer than :data:`FEWEST_SEEDS` values on either side.
         seeds: number of values on either side.
+        mixed: whether values of one side are of several configurations; there is no p-value then.
     """
 
     mean: float
@@ -29,9 +31,23 @@ class Difference:
     high: float
     p: float
     seeds: tuple[int, int]
+    mixed: bool = False
 
     def within(self, margin: float) -> bool:
-        """Whether the whole interval lies within ±``margin``: the two are equivalent by it."""
+        """Whether the whole interval lies within ±``margin``: the two are equivalent by it.
+
+        Fewer than :data:`FEWEST_SEEDS` values on either side are equivalent to nothing. Where none
+        varies there is no interval, and the difference itself must lie within.
+
+        Examples:
+            >>> same, apart = [500.0] * 10, [400.0] * 10
+            >>> [gap.within(5.0) for b in (same, apart) if (gap := difference(same, b))]
+            [True, False]
+        """
+        if min(self.seeds) < FEWEST_SEEDS:
+            return False
+        if math.isnan(self.low):
+            return abs(self.mean) < margin
         return self.low > -margin and self.high < margin
 
 
@@ -49,7 +65,7 @@ def difference(a: Sequence[float], b: Sequence[float], level: float = 0.95) -> D
     Examples:
         >>> found = difference([1.0, 2.0, 3.0], [3.0, 5.0, 7.0])
         >>> f"{found.mean} [{found.low:.2f}, {found.high:.2f}], p = {found.p:.2f}"
-        '-3.0 [-6.82, 0.82], p = 0.09'
+        '-3.0 [-7.16, 1.16], p = 0.10'
     """
     if not a or not b:
         return None

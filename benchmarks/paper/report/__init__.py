@@ -10,7 +10,7 @@ from report.results import Results, Score
 from report.runs import Acting, Run, RunFolders, read_run, read_runs
 from report.sections import Picture, Section
 from report.sensitivity import Trial, read_trials, write_trials
-from report.significance import published_difference, verdict
+from report.significance import published_difference
 from report.tables import NOT_RUN, Number, Stat, Table
 
 __all__ = [
@@ -40,6 +40,5 @@ __all__ = [
     "samples_to_90",
     "system",
     "systems",
-    "verdict",
     "write_trials",
 ]

@@ -8,10 +8,20 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
-from measures import FEWEST_SEEDS, Between, Difference, difference, holm, ratio_between
+from measures import (
+    FEWEST_SEEDS,
+    Between,
+    Difference,
+    holm,
+    mean_between,
+    ratio_between,
+    ratio_interval,
+)
 from phihp_torchrl.evaluation import PUBLISHED
 from report.bounds import margin
-from report.efficiency import sample_efficiency
+from report.cells import MIXED, is_mixed
+from report.comparison import compared
+from report.efficiency import efficiency_of_seeds, sample_efficiency
 from report.paper_systems import (
     DD_CEM,
     PH_CEM,
@@ -25,13 +35,15 @@ from report.paper_systems import (
     PaperSystem,
 )
 from report.planner_and_actor import planning_gain, usual_groups
-from report.results import TASKS, Results, Score
+from report.results import TASKS, Results, Score, well_filled
 from report.sections import Section
-from report.significance import LEVEL
 from report.tables import Table, TableCell
 
 FEWER = 5.0
 """The claim is of 5 to 15 times fewer samples."""
+
+LEVEL = 0.05
+"""Below this p-value, adjusted by Holm, a difference counts as significant."""
 
 SHOWN, NOT_SHOWN, REFUTED, NOT_RUN = "shown", "not shown", "refuted", "not run"
 
@@ -44,15 +56,18 @@ class Finding:
 
     Args:
         what: the task, or the systems and the task.
-        verdict: :data:`SHOWN`, :data:`NOT_SHOWN` or :data:`REFUTED`.
+        verdict: :data:`SHOWN`, :data:`NOT_SHOWN` or :data:`REFUTED`, or
+            :data:`~report.cells.MIXED` where runs of several configurations are compared.
         effect: its size, in words.
-        interval: what the effect lies between.
+        ends: what the effect lies between, where it is known by its ends alone.
+        interval: its 95 % interval over training seeds.
         seeds: number of training seeds on either side.
     """
 
     what: str
     verdict: str
     effect: str
+    ends: str
     interval: str
     seeds: str
 
@@ -72,11 +87,11 @@ def claims_section(results: Results) -> Section:
     if published := _published_samples(results):
         lines.append(f"- {published}")
     rows: list[list[TableCell]] = [
-        [f"{i}, {f.what}", f.verdict, f.effect, f.interval, f.seeds]
+        [f"{i}, {f.what}", f.verdict, f.effect, f.ends, f.interval, f.seeds]
         for i, findings in enumerate(claims.values(), 1)
         for f in findings
     ]
-    header = ["claim, comparison", "verdict", "effect", "lies between", "seeds"]
+    header = ["claim, comparison", "verdict", "effect", "lies between", "95 % interval", "seeds"]
     return Section(
         "The paper's claims", "\n".join(lines), {"Comparisons": Table("claims", header, rows)}
     )
@@ -90,12 +105,12 @@ def sentence(findings: Sequence[Finding]) -> str:
     total = len(findings)
     parts = [
         f"{verdict} in {counts[verdict]}"
-        for verdict in (SHOWN, NOT_SHOWN, REFUTED)
+        for verdict in (SHOWN, NOT_SHOWN, REFUTED, MIXED)
         if counts[verdict]
     ]
     named = "; ".join(
         f"{verdict}: {', '.join(f.what for f in findings if f.verdict == verdict)}"
-        for verdict in (SHOWN, REFUTED)
+        for verdict in (SHOWN, REFUTED, MIXED)
         if counts[verdict]
     )
     return f"{', '.join(parts)} of {total} comparisons{f' ({named})' if named else ''}."
@@ -105,18 +120,25 @@ def fewer_samples(results: Results) -> list[Finding]:
     """TD-MPC's samples to 90 % over PhIHP's, by task, as far as their ends tell."""
     findings = []
     for task in TASKS:
-        ours = sample_efficiency(results, PHIHP, task)
-        theirs = sample_efficiency(results, TD_MPC, task)
-        if ours is not None and theirs is not None:
-            ratio = ratio_between(theirs, ours)
-            effect = f"{ours} against {theirs} samples"
-            seeds = _count(results.scores(PHIHP, task)), _count(results.scores(TD_MPC, task))
-            findings.append(_of_ratio(task, ratio, FEWER, effect, seeds))
+        ours, theirs = (efficiency_of_seeds(results, one, task) for one in (PHIHP, TD_MPC))
+        if ours and theirs:
+            between = mean_between(theirs), mean_between(ours)
+            compared_scores = [s for one in (PHIHP, TD_MPC) for s in results.scores(one, task)]
+            findings.append(
+                _of_ratio(
+                    task,
+                    (theirs, ours),
+                    ratio_between(*between),
+                    FEWER,
+                    f"{between[1]} against {between[0]} samples",
+                    compared_scores,
+                )
+            )
     return findings
 
 
 def planning_improves(results: Results) -> list[Finding]:
-    """Planner less actor at the usual number of samples, by task."""
+    """Agent less actor at the usual number of samples, by task."""
     groups = usual_groups(results.runs)
     found = {task: planning_gain(groups[task]) for task in groups if task in TASKS}
     return _of_differences(found, {task: task for task in found})
@@ -129,9 +151,16 @@ def faster(results: Results) -> list[Finding]:
         scores = [results.usual(system, task) for system in (PHIHP, TD_MPC)]
         ours, theirs = (_times(each) for each in scores)
         if ours and theirs:
-            ratio = Between(min(theirs) / max(ours), max(theirs) / min(ours))
-            effect = f"{fmean(ours):.1f} ms against {fmean(theirs):.1f}"
-            findings.append(_of_ratio(task, ratio, 1.0, effect, (len(ours), len(theirs))))
+            findings.append(
+                _of_ratio(
+                    task,
+                    ([Between(t, t) for t in theirs], [Between(t, t) for t in ours]),
+                    Between(min(theirs) / max(ours), max(theirs) / min(ours)),
+                    1.0,
+                    f"{fmean(ours):.1f} ms against {fmean(theirs):.1f}",
+                    [score for side in scores for score in side],
+                )
+            )
     return findings
 
 
@@ -144,7 +173,7 @@ def _higher(results: Results, pairs: Iterable[tuple[PaperSystem, PaperSystem]]) 
             ours, theirs = results.usual(first, task), results.usual(second, task)
             if first is not PHIHP:
                 ours, theirs = _at_equal_samples(results, first, second, task)
-            gap = difference([s.mean for s in ours], [s.mean for s in theirs])
+            gap = compared(ours, theirs)
             if gap is not None:
                 what = task if first is PHIHP else f"{first.name} on {task}"
                 found[what], tasks[what] = gap, task
@@ -152,53 +181,76 @@ def _higher(results: Results, pairs: Iterable[tuple[PaperSystem, PaperSystem]]) 
 
 
 def _of_differences(found: dict[str, Difference], tasks: dict[str, str]) -> list[Finding]:
-    """Findings of one family of tests, by Holm."""
+    """Findings of one family of tests, by Holm; mixed ones are not tested."""
     findings = []
     adjusted = holm([gap.p for gap in found.values()])
     for (what, gap), p in zip(found.items(), adjusted, strict=True):
         verdict = NOT_SHOWN if not p < LEVEL else SHOWN if gap.mean > 0 else REFUTED
+        if gap.mixed:
+            verdict = MIXED
         effect = _text(gap.mean, "+") + ("" if math.isnan(p) else f", p = {p:.2g}")
         within = margin(tasks[what])
         if verdict == NOT_SHOWN and within is not None and gap.within(within):
             effect += ", equivalent"
         ends = "–" if math.isnan(gap.low) else f"{_text(gap.low)} to {_text(gap.high)}"
-        findings.append(Finding(what, verdict, effect, ends, f"{gap.seeds[0]}, {gap.seeds[1]}"))
+        seeds = f"{gap.seeds[0]}, {gap.seeds[1]}"
+        findings.append(Finding(what, verdict, effect, "–", ends, seeds))
     return findings
 
 
 def _of_ratio(
-    what: str, ratio: Between, least: float, effect: str, seeds: tuple[int, int]
+    what: str,
+    sides: tuple[Sequence[Between], Sequence[Between]],
+    ratio: Between,
+    least: float,
+    effect: str,
+    scores: Iterable[Score],
 ) -> Finding:
-    """Shown where the whole of it is at least ``least``, refuted where none of it is.
+    """Shown where the ratio is at least ``least`` by its ends and by its interval, or refuted.
 
-    What a ratio lies between says nothing of how it varies from seed to seed, so that fewer than
-    :data:`~measures.FEWEST_SEEDS` on either side show nothing.
+    What a ratio lies between says nothing of how it varies from seed to seed, so that its interval
+    over seeds must agree. Fewer than :data:`~measures.FEWEST_SEEDS` on either side show nothing.
+
+    Args:
+        what: the task.
+        sides: what the number of each seed lies between, above and below.
+        ratio: what the ratio lies between.
+        least: the claim is that it is this or more.
+        effect: its size, in words.
+        scores: those of either side, which may be mixed.
     """
-    verdict = SHOWN if ratio.low >= least else REFUTED if ratio.high < least else NOT_SHOWN
-    if min(seeds) < FEWEST_SEEDS:
-        verdict = NOT_SHOWN
-    above = "" if math.isinf(ratio.high) else f" to {ratio.high:.1f}"
-    interval = f"{ratio.low:.1f}{above or ' and more'} times"
-    return Finding(what, verdict, effect, interval, f"{seeds[0]}, {seeds[1]}")
+    interval, seeds = ratio_interval(*sides), (len(sides[1]), len(sides[0]))
+    verdict = NOT_SHOWN
+    if is_mixed(score.run for score in scores):
+        verdict = MIXED
+    elif min(seeds) >= FEWEST_SEEDS:
+        if ratio.low >= least and interval.low > least:
+            verdict = SHOWN
+        elif ratio.high < least and interval.high < least:
+            verdict = REFUTED
+    return Finding(
+        what, verdict, effect, _times_text(ratio), _times_text(interval), f"{seeds[0]}, {seeds[1]}"
+    )
+
+
+def _times_text(ratio: Between) -> str:
+    above = " and more" if math.isinf(ratio.high) else f" to {ratio.high:.1f}"
+    return f"{ratio.low:.1f}{above} times"
 
 
 def _at_equal_samples(
     results: Results, first: PaperSystem, second: PaperSystem, task: str
 ) -> tuple[list[Score], list[Score]]:
-    """The scores of both at the largest number of samples that both were run with."""
+    """The scores of both at the largest number of samples that both have enough seeds of."""
     both = [results.scores(system, task) for system in (first, second)]
-    common = set.intersection(*({score.run.samples for score in scores} for scores in both))
-    ours, theirs = ([s for s in scores if s.run.samples == max(common, default=0)]
+    filled = well_filled(*([score.run.samples for score in scores] for scores in both))
+    ours, theirs = ([s for s in scores if s.run.samples == max(filled, default=0)]
                     for scores in both)  # fmt: skip
     return ours, theirs
 
 
 def _times(scores: Sequence[Score]) -> list[float]:
     return [score.milliseconds for score in scores if score.milliseconds is not None]
-
-
-def _count(scores: Sequence[Score]) -> int:
-    return len({score.run.seed for score in scores})
 
 
 def _published_samples(results: Results) -> str:

@@ -62,16 +62,21 @@ def samples_to_90(points: Sequence[tuple[int, float]]) -> Between:
     return Between(before, first)
 
 
-def sample_efficiency(results: Results, system: PaperSystem, task: str) -> Between | None:
-    """What a system's mean over seeds lies between; ``None`` if it was not run.
+def efficiency_of_seeds(results: Results, system: PaperSystem, task: str) -> list[Between]:
+    """What the samples of each seed lie between, by seed.
 
     A seed with few runs has wide ends, and makes those of the mean wide: none is left out.
     """
-    by_seed = points_by_seed(results.scores(system, task))
-    return mean_between([samples_to_90(p) for p in by_seed.values()]) if by_seed else None
+    return [samples_to_90(p) for p in points_by_seed(results.scores(system, task)).values()]
+
+
+def sample_efficiency(results: Results, system: PaperSystem, task: str) -> Between | None:
+    """What a system's mean over seeds lies between; ``None`` if it was not run."""
+    found = efficiency_of_seeds(results, system, task)
+    return mean_between(found) if found else None
 
 
 def samples_cell(results: Results, system: PaperSystem, task: str) -> Ends:
     """The same for a table, with the number of seeds."""
-    seeds = {score.run.seed for score in results.scores(system, task)}
-    return Ends(sample_efficiency(results, system, task), len(seeds))
+    found = efficiency_of_seeds(results, system, task)
+    return Ends(mean_between(found) if found else None, len(found))

@@ -29,7 +29,8 @@ def overview(runs: Sequence[Run]) -> str:
             f"## {label}\n",
             "PhIHP; the commands in full are in `results/runs/*/metadata.json`. Mean ± std over "
             f"seeds, {_episodes(chosen)} evaluation episodes each, from seeds that no training "
-            f"uses. {origins(chosen)}\n",
+            "uses. Where calibration lets the actor act, its return is that of the planner too. "
+            f"{origins(chosen)}\n",
             "### Returns at the default preset's number of real samples, else at the most\n",
             returns_markdown(chosen),
             section_markdown(acting_section(chosen), level=2, title=False),

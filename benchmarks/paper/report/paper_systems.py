@@ -23,6 +23,9 @@ _PAPER_ORDER = (
 )
 # Methods that the paper does not have come after those of their group.
 
+AGENT = "agent"
+"""How an agent acts as it was saved: by plans, or by its actor if calibration said so."""
+
 _WAY = {"hybrid_planner": "planner", "plain_planner": "planner", "actor": "actor"}
 
 
@@ -32,7 +35,8 @@ class PaperSystem:
 
     Args:
         name: the paper's name.
-        sources: methods whose runs it is in, and how it acts there (``None``: as that run does).
+        sources: methods whose runs it is in, and how it acts there (``None``: as that run does;
+            :data:`AGENT`: by plans, unless calibration has let the actor act).
             The first that a seed was run with counts: PhIHP's actor alone is TD3-im-ph.
     """
 
@@ -46,10 +50,14 @@ def system(method: str) -> PaperSystem:
     Examples:
         >>> system("td3-im-ph").sources
         (('td3-im-ph', 'actor'), ('phihp', 'actor'))
+        >>> system("phihp").sources
+        (('phihp', 'agent'),)
     """
     known = get_method(method)
     also = () if known.also_in is None else (known.also_in,)
-    return PaperSystem(known.label, ((method, _WAY.get(known.acting)), *also))
+    # No run is left out for what its calibration chose: that would select on the outcome.
+    way = AGENT if "calibrate" in known.phases else _WAY.get(known.acting)
+    return PaperSystem(known.label, ((method, way), *also))
 
 
 def systems(*groups: str) -> tuple[PaperSystem, ...]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-from measures import DEFAULT_SAMPLES, PUBLISHED_SAMPLES
+from measures import DEFAULT_SAMPLES, FEWEST_SEEDS, PUBLISHED_SAMPLES, agent_in
 from phihp_torchrl.evaluation import TARGETS
 from report.bounds import normalise
-from report.paper_systems import PaperSystem
+from report.paper_systems import AGENT, PaperSystem
 from report.runs import Acting, Run
 
 TASKS = tuple(PUBLISHED_SAMPLES)
@@ -18,15 +19,42 @@ SIX_TASKS = tuple(TARGETS)
 """The six tasks that averages are over."""
 
 
-def usual_samples(task: str, numbers: Collection[int]) -> int:
+def well_filled(*sides: Iterable[int]) -> set[int]:
+    """The numbers of real samples that there are enough seeds of, on each side of a comparison.
+
+    One seed more at another number must not move a comparison there.
+
+    Args:
+        sides: the numbers of samples of a side, one for each seed.
+
+    Returns:
+        Those with :data:`~measures.FEWEST_SEEDS` on each side; where there are none, all that the
+        sides have in common.
+
+    Examples:
+        >>> well_filled([200, 200, 200, 1000]), sorted(well_filled([200, 1000], [200, 1000, 2000]))
+        ({200}, [200, 1000])
+    """
+    counts = [Counter(side) for side in sides]
+    common = set.intersection(*map(set, counts))
+    return {n for n in common if min(side[n] for side in counts) >= FEWEST_SEEDS} or common
+
+
+def usual_samples(task: str, numbers: Iterable[int]) -> int:
     """The number of real samples to compare at: the default preset's if it is there, or the most.
+
+    Args:
+        task: name of the task.
+        numbers: the numbers of samples, one for each seed; of :func:`well_filled` ones, if any.
 
     Examples:
         >>> usual_samples("pendulum", [200, 1000, 2000]), usual_samples("pendulum", [200, 30_000])
         (1000, 30000)
+        >>> usual_samples("pendulum", [200, 200, 200, 1000])
+        200
     """
-    default = DEFAULT_SAMPLES.get(task)
-    return default if default is not None and default in numbers else max(numbers, default=0)
+    filled, default = well_filled(numbers), DEFAULT_SAMPLES.get(task)
+    return default if default is not None and default in filled else max(filled, default=0)
 
 
 @dataclass(frozen=True)
@@ -89,7 +117,8 @@ class Results:
             for run in self.runs:
                 if (run.method, run.task) != (method, task):
                     continue
-                acting = wanted or next(iter(run.acting))
+                acting = agent_in(run.acting) if wanted == AGENT else wanted
+                acting = acting or next(iter(run.acting))
                 if acting in run.acting:
                     found.setdefault((run.samples, run.seed), Score(run, acting))
         return [found[key] for key in sorted(found)]
@@ -97,7 +126,7 @@ class Results:
     def usual(self, system: PaperSystem, task: str) -> list[Score]:
         """The scores at the usual number of real samples, by seed."""
         scores = self.scores(system, task)
-        chosen = usual_samples(task, {score.run.samples for score in scores})
+        chosen = usual_samples(task, (score.run.samples for score in scores))
         return [score for score in scores if score.run.samples == chosen]
 
     def has_run(self, system: PaperSystem, task: str) -> bool:

@@ -6,7 +6,7 @@ import csv
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -53,7 +53,10 @@ class Run:
         seed: its seed.
         kind: kind of its model; ``None`` for a method without one.
         configuration: fingerprint of its settings, equal for runs that differ by their seed alone.
-        commit: abbreviated, with a ``+`` if the source had been changed.
+        commit: abbreviated, with a ``+`` if the source had been changed, when it was begun.
+        commits: abbreviated, of all its sessions: a run that was resumed may have several.
+        dirty: whether the source had been changed in any session; ``None`` where that of one is
+            unknown and no other was.
         machine: what it ran on.
         seconds: time of each phase.
         acting: by way of acting, ``"planner"`` or ``"actor"``.
@@ -70,6 +73,8 @@ class Run:
     kind: str | None
     configuration: str
     commit: str
+    commits: tuple[str, ...]
+    dirty: bool | None
     machine: str
     seconds: Mapping[str, float]
     acting: Mapping[str, Acting]
@@ -142,12 +147,18 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
         kind=kind,
         configuration=configuration_hash(config),
         commit=commit_text(session),
+        commits=tuple(sorted({str(one["commit"])[:7] for one in metadata["sessions"]})),
+        dirty=_dirty([one.get("dirty") for one in metadata["sessions"]]),
         machine=machine_text(session),
         seconds={str(k): float(v) for k, v in metadata["seconds"].items()},
         acting=_acting(_read_json(folder / "evaluation.json")),
         curve=_curve(folder),
         prediction=_numbers(folder / "prediction.json"),
     )
+
+
+def _dirty(sessions: Sequence[bool | None]) -> bool | None:
+    return True if any(sessions) else None if None in sessions else False
 
 
 def _read_json(path: Path) -> dict[str, Any]:

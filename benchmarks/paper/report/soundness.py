@@ -1,10 +1,10 @@
-"""Whether the runs of a cell fit together: one configuration, committed code, fresh seeds."""
+"""Whether the runs of a cell fit together: one configuration, one commit, fresh seeds."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
+from report.cells import cells, configurations
 from report.runs import Run
 from report.sections import Section
 from report.tables import Table, TableCell
@@ -15,30 +15,35 @@ REPORT_SEED = 100
 
 def soundness(runs: Iterable[Run]) -> Section:
     """A row for each cell whose runs do not fit together, or that no commit can make again."""
-    cells: dict[tuple[str, str, int], list[Run]] = defaultdict(list)
-    for run in runs:
-        cells[run.task, run.method, run.samples].append(run)
+    by_cell = cells(runs)
     rows: list[list[TableCell]] = []
-    for (task, method, samples), group in sorted(cells.items()):
-        configurations = {run.configuration for run in group}
-        dirty = sorted(run.seed for run in group if run.commit.endswith("+"))
-        tuned = sorted(run.seed for run in group if run.seed < REPORT_SEED)
-        if len(configurations) > 1 or dirty or tuned:
+    for (task, method, samples), group in by_cell.items():
+        kinds, commits = configurations(group), {commit for run in group for commit in run.commits}
+        dirty = [run.seed for run in group if run.dirty]
+        unknown = [run.seed for run in group if run.dirty is None]
+        tuned = [run.seed for run in group if run.seed < REPORT_SEED]
+        if max(kinds, len(commits)) > 1 or dirty or unknown or tuned:
             rows.append(
                 [
                     f"{task}, {method}, {samples}",
                     str(len(group)),
-                    str(len(configurations)),
-                    ", ".join(map(str, dirty)) or "–",
-                    ", ".join(map(str, tuned)) or "–",
+                    str(kinds),
+                    ", ".join(sorted(commits)),
+                    *map(_seeds, (dirty, unknown, tuned)),
                 ]
             )
     text = (
-        "Seeds of a cell should be of one configuration, of committed code, and from "
-        f"{REPORT_SEED} on, which no choice of a default has seen. "
-        + (f"That is not so in {len(rows)} of {len(cells)} cells." if rows else "That is so.")
+        "Seeds of a cell should be of one configuration, of one commit in all their sessions, of "
+        f"code without other changes, and from {REPORT_SEED} on, which no choice of a default has "
+        "seen. "
+        + (f"That is not so in {len(rows)} of {len(by_cell)} cells." if rows else "That is so.")
+        + " Comparisons of cells with several configurations get no verdict."
     )
-    header = ["cell, real samples", "runs", "configurations", "seeds of changed code"]
-    header += [f"seeds below {REPORT_SEED}"]
+    header = ["cell, real samples", "runs", "configurations", "commits", "seeds of changed code"]
+    header += ["seeds of code that may have been changed", f"seeds below {REPORT_SEED}"]
     tables = {"Cells": Table("soundness", header, rows)} if rows else {}
     return Section("Soundness", text, tables)
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return ", ".join(map(str, sorted(seeds))) or "–"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from kept_runs import make_run, results
+from kept_runs import make, make_run, results, table, text
 
 from report.claims import claims_section, fewer_samples, planning_improves
 from report.paper_systems import (
@@ -43,10 +43,12 @@ def test_each_claim_gets_its_verdict(tmp_path: Path) -> None:
         "not shown",
         "≤ 1000 against 2000–9000 samples",
         "2.0 and more times",
+        "2.0 and more times",
         "3, 3",
     ]
-    assert rows["5, pendulum"][:3] == ["shown", "4.0 ms against 20.0", "5.0 to 5.0 times"]
-    assert rows["4, Ph-CEM on pendulum"][3] == "3, 3"
+    ratio = "5.0 to 5.0 times"
+    assert rows["5, pendulum"][:4] == ["shown", "4.0 ms against 20.0", ratio, ratio]
+    assert rows["4, Ph-CEM on pendulum"][2:] == ["–", "−0.1 to 0.3", "3, 3"]
     assert [finding.what for finding in fewer_samples(found)] == ["pendulum"]
 
 
@@ -69,7 +71,7 @@ def test_a_claim_needs_three_seeds_and_differences_beyond_their_noise(tmp_path: 
 
 def test_samples_known_by_their_ends_can_show_a_claim_or_refute_it(tmp_path: Path) -> None:
     acting, planned = {"planner": [9.0], "actor": [1.0]}, {"planner": [9.0]}
-    curves = {"pendulum": ((500, 0.0), (1000, 9.0)), "acrobot": ((100, 9.0),)}
+    curves = {"pendulum": ((501, 0.0), (1000, 9.0)), "acrobot": ((100, 9.0),)}
     for seed in (0, 1, 2):
         for task, curve in curves.items():
             make_run(tmp_path, task=task, seed=seed, samples=100, acting=acting)
@@ -94,3 +96,75 @@ def test_hybrid_and_data_driven_are_compared_at_equal_samples_alone(tmp_path: Pa
     assert not found.has_run(PH_CEM, "pendulum")
     assert not found.has_run(TD_MPC, "pendulum")
     assert "not run" in claims_section(found).text.splitlines()[3]
+
+
+def test_seeds_that_disagree_do_not_show_a_ratio(tmp_path: Path) -> None:
+    """The mean is beyond the bound, its interval over seeds is not."""
+    for seed, before in enumerate((100, 200, 1800)):
+        make_run(tmp_path, seed=seed, samples=100, acting={"planner": [9.0], "actor": [1.0]})
+        curve = ((before, 0.0), (before + 100, 9.0))
+        make_run(tmp_path, "td-mpc", seed=seed, samples=2000, curve=curve,
+                 acting={"planner": [9.0]})  # fmt: skip
+    (found,) = fewer_samples(results(tmp_path))
+    assert found.ends == "7.0 and more times"
+    assert found.interval == "1.0 and more times"
+    assert found.verdict == "not shown"
+
+
+def test_a_seed_whose_actor_acts_gains_nothing_and_counts(tmp_path: Path) -> None:
+    for seed, gain in enumerate((8.0, 9.0)):
+        make_run(tmp_path, seed=seed, acting={"planner": [gain], "actor": [0.0]})
+    make_run(tmp_path, seed=2, acting={"actor": [5.0]})
+    (mean,) = planning_improves(results(tmp_path))
+    assert (mean.effect.split(",")[0], mean.seeds) == ("+5.7", "3, 3")
+    for seed in range(3):
+        make_run(tmp_path, task="cartpole", seed=seed, acting={"actor": [500.0]})
+    nil = {finding.what: finding for finding in planning_improves(results(tmp_path))}["cartpole"]
+    assert (nil.verdict, nil.effect, nil.seeds) == ("not shown", "+0.0, equivalent", "3, 3")
+
+
+def test_a_cell_of_several_configurations_gets_no_verdict(tmp_path: Path) -> None:
+    for seed in (0, 1, 2):
+        acting = {"planner": [9.0 + seed], "actor": [1.0]}
+        folder = make_run(tmp_path / "runs", seed=seed, acting=acting)
+        td3 = {"actor": [0.1 * seed]}
+        make_run(tmp_path / "runs", "td3", seed=seed, samples=300, acting=td3)
+        planned = {"planner": [9.0 + seed]}
+        make_run(tmp_path / "runs", "td-mpc", seed=seed, samples=9000, acting=planned, ms=90.0)
+    config = folder / "config.yaml"
+    config.write_text(config.read_text() + "evaluate: {first_seed: 2000000}\n")
+    section = claims_section(results(tmp_path / "runs"))
+    rows = {str(row[0]): [str(cell) for cell in row] for row in section.tables["Comparisons"].rows}
+    assert {name: row[1] for name, row in rows.items()} == {
+        "1, pendulum": "mixed",
+        "2, pendulum": "mixed",
+        "3, pendulum": "mixed",
+        "5, pendulum": "mixed",
+    }
+    assert rows["3, pendulum"][2] == "+9.0", "no p"
+    assert "mixed in 1 of 1 comparisons (mixed: pendulum)" in section.text
+    make(tmp_path)
+    assert table(tmp_path, "planning_gain")[0]["p"] == "mixed"
+    assert table(tmp_path, "differences")[0]["p"] == "mixed"
+
+
+def test_a_comparison_has_one_verdict(tmp_path: Path) -> None:
+    """That of its claim; tables of other families of tests are to explore."""
+    make_run(tmp_path / "runs")
+    made = make(tmp_path)
+    for name, title in (
+        ("differences", "PhIHP against each baseline"),
+        ("planning_gain", "PhIHP, planner and actor"),
+    ):
+        assert "xploratory" in text(made, title)
+        assert not [key for key in table(tmp_path, name)[0] if key.endswith(" is")]
+
+
+def test_equal_samples_are_those_with_enough_seeds(tmp_path: Path) -> None:
+    for seed in (0, 1, 2):
+        make_run(tmp_path, "ph-cem", seed=seed, samples=500, acting={"planner": [5.0 + seed]})
+        make_run(tmp_path, "dd-cem", seed=seed, samples=500, acting={"planner": [4.0 + seed]})
+    for method in ("ph-cem", "dd-cem"):
+        make_run(tmp_path, method, samples=5000, acting={"planner": [1.0]})
+    rows = claims_section(results(tmp_path)).tables["Comparisons"].rows
+    assert [(row[0], row[-1]) for row in rows] == [("4, Ph-CEM on pendulum", "3, 3")]

@@ -12,7 +12,7 @@ import torch
 from kept_runs import make, make_run, results, table
 from scipy import stats
 
-from measures import DEFAULT_SAMPLES, Between, difference, holm
+from measures import DEFAULT_SAMPLES, Between, difference, holm, ratio_interval
 from phihp_torchrl import get_task, load_config
 from report import (
     BOUNDS,
@@ -21,13 +21,13 @@ from report import (
     published_difference,
     read_run,
     samples_to_90,
-    verdict,
 )
 from report.aggregate import aggregates, profiles, score_matrix
 from report.curves import mean_over_tasks, sample_curves, update_curves
 from report.efficiency import learning_points, sample_efficiency
 from report.learning_curve import learning_curve
 from report.paper_systems import PHIHP, TD3, TD3_IM_PH, system
+from report.planner_and_actor import acting_section, returns_markdown, usual_groups
 from report.time_to_return import seconds_to
 
 
@@ -117,9 +117,8 @@ def test_a_difference_against_numbers_worked_by_hand() -> None:
     half = stats.t.ppf(0.975, freedom) * error
     assert (found.low, found.high) == pytest.approx((-3 - half, -3 + half))
     assert found.p == pytest.approx(2 * stats.t.sf(3 / error, freedom))
-    assert verdict(found, found.p, within=None) == "nothing shown"
-    assert verdict(found, 0.01, within=None) == "lower"
-    assert verdict(found, found.p, within=10.0) == "equivalent"
+    assert found.within(10.0)
+    assert not found.within(3.5)
 
 
 def test_there_is_no_p_value_of_few_seeds_or_without_spread() -> None:
@@ -127,19 +126,20 @@ def test_there_is_no_p_value_of_few_seeds_or_without_spread() -> None:
     one = difference([1.0], [2.0, 3.0])
     assert one is not None
     assert math.isnan(one.low)
-    assert verdict(one, one.p, within=100.0) == "too few seeds"
+    assert not one.within(100.0)
     two = difference([1.0, 2.0], [5.0, 6.0, 7.0])
     assert two is not None
     assert two.low < two.mean < two.high
     assert math.isnan(two.p)
+    assert not two.within(100.0), "two seeds are equivalent to nothing"
     equal = difference([500.0] * 3, [500.0] * 3)
     assert equal is not None
     assert math.isnan(equal.p)
-    assert verdict(equal, equal.p, within=5.0) == "the same in every run"
+    assert equal.within(5.0)
     apart = difference([500.0] * 3, [400.0] * 3)  # an infinite t is none
     assert apart is not None
     assert math.isnan(apart.p)
-    assert verdict(apart, apart.p, within=5.0) == "nothing shown"
+    assert not apart.within(5.0)
 
 
 def test_the_published_difference() -> None:
@@ -190,6 +190,48 @@ def test_a_matrix_has_as_many_seeds_as_all_tasks_have(tmp_path: Path) -> None:
     assert matrix is not None
     assert matrix.tolist() == [[1.0, 0.5]]
     assert score_matrix(results(tmp_path), PHIHP, ("cartpole", "pendulum")) is None
+
+
+def test_one_seed_at_other_samples_moves_no_comparison(tmp_path: Path) -> None:
+    """Neither to the default preset's number of samples nor to more."""
+    for seed in range(3):
+        make_run(tmp_path, samples=200, seed=seed)
+    for samples in (1000, 2000):
+        make_run(tmp_path, samples=samples)
+    found = results(tmp_path)
+    assert [score.run.samples for score in found.usual(PHIHP, "pendulum")] == [200] * 3
+    assert {task: len(runs) for task, runs in usual_groups(found.runs).items()} == {"pendulum": 3}
+
+
+def test_a_run_whose_calibration_lets_the_actor_act_is_left_out_nowhere(tmp_path: Path) -> None:
+    folder = make_run(tmp_path, acting={"planner": [-100.0], "actor": [-140.0]}, ms=5.0)
+    timed = json.loads((folder / "evaluation.json").read_text())
+    timed["planner"]["latency_ms_p50"] = 0.1  # where a plan serves many actions it is not the mean
+    (folder / "evaluation.json").write_text(json.dumps(timed))
+    make_run(tmp_path, seed=1, acting={"actor": [-120.0]}, ms=1.0)
+    make_run(tmp_path, "td-mpc-star", acting={"actor": [-300.0]})
+    found = results(tmp_path)
+    assert [score.mean for score in found.usual(PHIHP, "pendulum")] == [-100.0, -120.0]
+    assert found.has_run(system("td-mpc-star"), "pendulum")
+    matrix = score_matrix(found, PHIHP, ("pendulum",))
+    assert matrix is not None
+    assert matrix.shape == (2, 1)
+    (gain,) = (
+        acting_section(found.runs).tables["What planning adds to the actor, the same episodes"].rows
+    )
+    assert [str(cell) for cell in (gain[2], gain[-1])] == ["20.00", "2"]
+    (times,) = acting_section(found.runs).tables["Time"].rows
+    assert [str(cell) for cell in times[-2:]] == ["5.0 (1)", "3.0 ± 2.8 (2)"]
+    assert "| pendulum | 2 | 1000 | −110.0 ± 14.1 | −130.0 ± 14.1 |" in returns_markdown(found.runs)
+
+
+def test_the_interval_of_a_ratio_is_wide_where_seeds_differ() -> None:
+    alike = ratio_interval([Between(500, 600)] * 3, [Between(50, 100)] * 3)
+    assert (alike.low, alike.high) == (5.0, 12.0)
+    apart = ratio_interval([Between(100, 100), Between(500, 500), Between(900, 900)],
+                           [Between(0, 100)] * 3)  # fmt: skip
+    assert apart.low < 5.0
+    assert apart.high == math.inf
 
 
 def test_the_default_presets_samples_go_before_more(tmp_path: Path) -> None:
