@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from datetime import datetime
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,15 @@ from typing import Any
 import torch
 
 _PACKAGES = ("phihp_torchrl", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
+_GIT_SECONDS = 60
+"""On a busy machine, or one whose files are far away, git needs its time."""
 
 
 def describe_origin(seed: int) -> dict[str, Any]:
     """Describe where a result comes from: seed, time, command, commit, machine and versions.
+
+    The commit is that of :func:`source_commit`. ``dirty`` says whether the source tree has
+    uncommitted changes now; it is ``None`` where git does not answer.
 
     Args:
         seed: the seed of the run.
@@ -33,15 +39,12 @@ def describe_origin(seed: int) -> dict[str, Any]:
     """
     versions = {"python": platform.python_version()}
     versions |= {package: package_version(package) for package in _PACKAGES}
-    # A script that writes its results as it goes changes them, but not the code that makes them.
-    places = (":(top)", ":(top,exclude)results")
-    status = _git("status", "--porcelain", "--untracked-files=no", "--", *places)
     return {
         "seed": seed,
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
-        "commit": _git("rev-parse", "HEAD"),
-        "dirty": None if status is None else bool(status),
+        "commit": source_commit(),
+        "dirty": has_changes(),
         "machine": {
             "system": f"{platform.system()} {platform.machine()}",
             "cpus": os.cpu_count(),
@@ -50,6 +53,47 @@ def describe_origin(seed: int) -> dict[str, Any]:
         },
         "versions": versions,
     }
+
+
+def source_commit() -> str | None:
+    """Return the commit that the source tree was at when this process first asked.
+
+    A process goes on with the code that it has imported, wherever ``HEAD`` moves meanwhile.
+    ``None`` if there is no git or no repository.
+    """
+    return _first_commit(_source())
+
+
+def has_changes() -> bool | None:
+    """Return whether the source tree has uncommitted changes; ``None`` if git does not answer.
+
+    Tracked files count. ``results/`` does not: a script that writes its results as it goes changes
+    them, but not the code that makes them.
+    """
+    places = (":(top)", ":(top,exclude)results")
+    status = ask_git(_source(), "status", "--porcelain", "--untracked-files=no", "--", *places)
+    return None if status is None else bool(status)
+
+
+def ask_git(folder: Path, *arguments: str) -> str | None:
+    """Return what git says in a folder; ``None`` if there is no git, no repository or no answer.
+
+    Examples:
+        >>> ask_git(Path("/no-such-folder"), "rev-parse", "HEAD") is None
+        True
+    """
+    try:
+        done = subprocess.run(
+            ["git", *arguments],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            timeout=_GIT_SECONDS,
+            check=True,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
 
 
 def package_version(package: str = "phihp_torchrl") -> str:
@@ -106,17 +150,10 @@ def _memory_gib() -> float | None:
         return None
 
 
-def _git(*arguments: str) -> str | None:
-    """Run git in the source tree; ``None`` if there is no git or no repository."""
-    try:
-        done = subprocess.run(
-            ["git", *arguments],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip()
+def _source() -> Path:
+    return Path(__file__).parent
+
+
+@cache
+def _first_commit(folder: Path) -> str | None:
+    return ask_git(folder, "rev-parse", "HEAD")

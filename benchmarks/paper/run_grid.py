@@ -1,7 +1,7 @@
 """Run a grid, methods x tasks x seeds x shares of the published samples, wherever there is room.
 
     python benchmarks/paper/run_grid.py method=phihp task=pendulum,acrobot seed=0,1,2 share=1,0.1
-    python benchmarks/paper/run_grid.py task=pendulum,acrobot seed=range(5) launcher=joblib jobs=2
+    python benchmarks/paper/run_grid.py task=pendulum,acrobot 'seed=range(5)' launcher=joblib jobs=2
 
 A finished cell is skipped, and refused if its settings are not those of now; one that was cut off
 goes on from its checkpoint, one that failed is reported. ``config/grid.yaml`` has more examples,

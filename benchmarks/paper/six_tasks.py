@@ -21,14 +21,13 @@ from pathlib import Path
 from statistics import median
 
 from measures import agent_in, paired_difference_of_seeds
-from phihp_torchrl.evaluation import PUBLISHED, markdown_table
+from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, markdown_table
 from report.overview import origins, put_between
 from report.runs import Run, read_runs
 
 RESULTS = Path("results/six_tasks")
 TASKS = ("pendulum", "pendulum-swingup", "cartpole", "cartpole-swingup", "acrobot",
          "acrobot-swingup")  # fmt: skip
-FIRST_SEED = 100
 START, END = "<!-- six-tasks:start -->", "<!-- six-tasks:end -->"
 """Between these README.md has its table."""
 AIMS = {
@@ -45,7 +44,7 @@ AIMS = {
 def ours(runs: Sequence[Run], task: str) -> list[Run]:
     """The default runs of a task with reporting seeds."""
     kept = [run for run in runs if (run.method, run.label, run.task) == ("phihp", "default", task)]
-    return sorted((run for run in kept if run.seed >= FIRST_SEED), key=lambda run: run.seed)
+    return sorted((run for run in kept if run.seed >= REPORT_SEED), key=lambda run: run.seed)
 
 
 def chatter(run: Run, name: str) -> float:
@@ -165,7 +164,7 @@ def main() -> None:
     results = parser.parse_args().results
     runs = read_runs(results, any_version=True).runs
     if not any(ours(runs, task) for task in TASKS):
-        parser.exit(1, f"{results}: expected default runs of seeds from {FIRST_SEED} on.\n")
+        parser.exit(1, f"{results}: expected default runs of seeds from {REPORT_SEED} on.\n")
     text = page(runs)
     (results / "README.md").write_text(text)
     if results == RESULTS:  # and not others' runs

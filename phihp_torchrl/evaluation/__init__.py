@@ -12,6 +12,7 @@ from phihp_torchrl.evaluation.returns import AT_ONCE, Evaluation, evaluate
 from phihp_torchrl.evaluation.seeds import (
     EVALUATION_SEED,
     PROOF_SEED,
+    REPORT_SEED,
     check_training_seed,
     evaluation_seed,
 )

@@ -8,6 +8,9 @@ EVALUATION_SEED = 1_000_000
 """The first seed of evaluation; training and the choice of actors use smaller seeds."""
 
 
+REPORT_SEED = 100
+"""The first training seed for reports; those before are for tuning."""
+
 PROOF_SEED = 2_000_000
 """The first seed of the episodes that are kept for a last proof: no report looks at them before."""
 

@@ -102,3 +102,13 @@ class CellFiles:
     def evaluation(self) -> Path:
         """The last file to be kept: a cell that has it is done."""
         return self.kept / "evaluation.json"
+
+    @property
+    def kept_failure(self) -> Path:
+        """What is kept of a cell that failed: its error in short."""
+        return self.kept / "failure.json"
+
+    @property
+    def planned(self) -> Path:
+        """The names of all cells that grids with these results were asked for."""
+        return self.results / "planned.json"

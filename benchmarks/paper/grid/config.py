@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,10 +13,19 @@ from phihp_torchrl.config import (
     check_count,
     check_not_negative,
     get_method,
+    override_key,
     override_lines,
+    parse_overrides,
 )
-from phihp_torchrl.evaluation import PROOF_SEED, check_training_seed
+from phihp_torchrl.evaluation import (
+    EVALUATION_SEED,
+    PROOF_SEED,
+    REPORT_SEED,
+    check_training_seed,
+)
 from phihp_torchrl.trainers import import_plugins
+
+_FIRST_SEED = "evaluate.first_seed"
 
 
 @dataclass(frozen=True)
@@ -29,10 +38,11 @@ class GridConfig:
         seed: of everything random in the run.
         share: real samples, as a share of the published number; ``None`` for the preset's own.
         label: name of the settings.
-        overrides: settings that all cells have, as on the command line of ``phihp train``.
+        overrides: settings that all cells have, as on the command line of ``phihp train``; the
+            seed of the evaluation is not among them.
         allow_dirty: whether to run code that no commit has, as for a trial; its runs say so.
         proof: whether the episodes are those kept for the last proof, which each cell may play
-            once; the code must be that of a commit.
+            once. The code must be that of one commit, and the training seed one for reports.
         retry_failed: whether to try cells again that ended with an error.
         runs: directory of the runs in full.
         results: directory of what is kept of finished runs.
@@ -74,7 +84,23 @@ class GridConfig:
         check_not_negative(self, "claim_wait", "refresh")
         if self.proof and self.allow_dirty:
             raise ConfigError("allow_dirty", "expected false with proof=true, got true.")
+        if self.proof and self.seed < REPORT_SEED:
+            raise ConfigError(
+                "seed",
+                f"expected {REPORT_SEED} or more with proof=true (smaller ones are for tuning), "
+                f"got {self.seed}.",
+            )
+        for key, settings in (
+            ("overrides", self.overrides),
+            ("method_overrides", self.method_overrides.get(self.method, ())),
+        ):
+            _refuse_first_seed(key, settings)
         self.cell()
+
+    @property
+    def first_seed(self) -> int:
+        """The seed of the cell's evaluation in the real world."""
+        return PROOF_SEED if self.proof else EVALUATION_SEED
 
     def words(self) -> list[str]:
         """The settings of the cell's run, but for its place, as on a command line."""
@@ -82,7 +108,7 @@ class GridConfig:
         lines = [f"task={cell.task}", f"method={cell.method}", f"seed={cell.seed}"]
         lines += ["progress=false", *override_lines({"plugins": self.plugins})]
         if self.proof:
-            lines.append(f"evaluate.first_seed={PROOF_SEED}")
+            lines.append(f"{_FIRST_SEED}={self.first_seed}")
         if cell.samples is not None:
             lines.append(f"{samples_key}={cell.samples}")
         return [*lines, *self.method_overrides.get(self.method, ()), *self.overrides]
@@ -107,3 +133,16 @@ class GridConfig:
     def files(self, root: Path) -> CellFiles:
         """The cell's files; relative directories are in ``root``."""
         return CellFiles(self.cell(), root / self.runs, root / self.results)
+
+
+def _refuse_first_seed(key: str, settings: Sequence[str]) -> None:
+    """Refuse settings that choose the episodes of the evaluation."""
+    section, name = _FIRST_SEED.split(".")
+    for line in parse_overrides(settings):
+        value = line.value() if override_key(line) == section else None
+        if override_key(line) == _FIRST_SEED or (isinstance(value, Mapping) and name in value):
+            raise ConfigError(
+                key,
+                f"expected no {_FIRST_SEED} among them, got {line.input_line!r}: use proof=true "
+                "for the episodes of the last proof, which only it may play.",
+            )

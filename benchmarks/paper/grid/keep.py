@@ -7,14 +7,19 @@ import json
 import logging
 import os
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from grid.cell import CellFiles
+from grid.claim import claim
 from measures import configuration_hash, curve_from_metrics, prediction_errors, write_curve
 from phihp_torchrl.deployment import Agent, load_agent
+from phihp_torchrl.evaluation import PROOF_SEED
+from phihp_torchrl.trainers.files import write_atomically
 from phihp_torchrl.worlds import SimulatedWorld, make_world
 
 _log = logging.getLogger(__name__)
@@ -38,16 +43,47 @@ def keep(files: CellFiles) -> None:
         points = curve_from_metrics(csv.DictReader(file))
     write_curve(files.run / CURVE, points)
     _replace(files.run / CURVE, files.kept / CURVE)
-    cell = {**asdict(files.cell), "configuration": fingerprint(files.run)}
+    cell = {
+        **asdict(files.cell),
+        "configuration": fingerprint(files.run),
+        "proof": _settings(files.run)["evaluate"].get("first_seed") == PROOF_SEED,
+    }
     (files.run / CELL).write_text(json.dumps(cell, indent=2) + "\n")
     _replace(files.run / CELL, files.kept / CELL)
     _keep_prediction(files)
     _replace(files.run / "evaluation.json", files.evaluation)
+    files.kept_failure.unlink(missing_ok=True)
+
+
+def keep_failure(files: CellFiles, record: Mapping[str, Any]) -> None:
+    """Keep in short how a cell failed, for a report to say why its number is missing.
+
+    The file goes when the cell has been tried again and is done.
+    """
+    files.kept.mkdir(parents=True, exist_ok=True)
+    short = {key: record[key] for key in ("error", "when", "commit")}
+    write_atomically(files.kept_failure, json.dumps(short, indent=2) + "\n")
+
+
+def keep_names(cells: Sequence[CellFiles]) -> None:
+    """Add the cells that a grid was asked for to the names in ``planned.json``.
+
+    With it a report can say how many of the planned cells there are, and which are missing.
+    """
+    for place in {files.planned: files for files in cells}.values():
+        names = {files.cell.name for files in cells if files.planned == place.planned}
+        with claim(place.runs / f"{place.planned.name}.lock", wait=60.0):
+            before = json.loads(place.planned.read_text()) if place.planned.is_file() else []
+            if names <= set(before):
+                continue
+            place.planned.parent.mkdir(parents=True, exist_ok=True)
+            planned = sorted(names | set(before))
+            write_atomically(place.planned, json.dumps(planned, indent=2) + "\n")
 
 
 def fingerprint(folder: Path) -> str:
     """That of the settings of a run, or of what is kept of it."""
-    return configuration_hash(yaml.safe_load((folder / "config.yaml").read_text()))
+    return configuration_hash(_settings(folder))
 
 
 def has_fingerprint(files: CellFiles) -> bool:
@@ -62,6 +98,11 @@ def is_whole(files: CellFiles) -> bool:
     if (files.run / "agent").is_dir():
         can_be_had.add(PREDICTION)
     return all((files.kept / name).is_file() for name in can_be_had)
+
+
+def _settings(folder: Path) -> dict[str, Any]:
+    settings: dict[str, Any] = yaml.safe_load((folder / "config.yaml").read_text())
+    return settings
 
 
 def _keep_prediction(files: CellFiles) -> None:

@@ -11,7 +11,9 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from grid.cell import CellFiles
+from grid.committed import check_committed
 from grid.display import failures, summary, table
+from grid.keep import keep_names
 from grid.status import CellState, Status, look
 from grid.sweep import swept_cells
 from phihp_torchrl.config import ConfigError
@@ -36,15 +38,18 @@ class LiveTable(Callback):
         return LiveTable, ()  # workers get one that shows nothing
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Refuse a grid with a wrong cell before anything is launched; then watch it."""
+        """Refuse a wrong cell or code without a commit; then note what is planned, and watch."""
         base: Any = OmegaConf.to_container(config, resolve=False)
         hydra = base.pop("hydra")
         root = Path(config.hydra.runtime.cwd)
         params = [f"{key}={value}" for key, value in (hydra["sweeper"].get("params") or {}).items()]
         try:
             self._cells = swept_cells(base, [*params, *hydra["overrides"]["task"]], root)
+            if not base["allow_dirty"]:
+                check_committed()
         except ConfigError as error:
             sys.exit(f"error: {error}")
+        keep_names(self._cells)
         if base["refresh"]:
             self._thread = threading.Thread(target=self._watch, args=(base["refresh"],))
             self._thread.daemon = True

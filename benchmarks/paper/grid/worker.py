@@ -7,22 +7,24 @@ import logging
 import shutil
 import socket
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra.core.global_hydra import GlobalHydra
 
 from grid.cell import CellFiles
 from grid.claim import claim
+from grid.committed import check_committed, check_sessions
 from grid.config import GridConfig
-from grid.keep import fingerprint, has_fingerprint, is_whole, keep
+from grid.keep import fingerprint, has_fingerprint, is_whole, keep, keep_failure
 from grid.status import CellState, Status, is_done, look
 from measures import configuration_hash
 from phihp_torchrl.config import ConfigError, compose_yaml, override_lines
-from phihp_torchrl.origin import describe_origin
+from phihp_torchrl.origin import source_commit
 from phihp_torchrl.trainers import RunDirectory, RunRequest, read_request, run
 
 _log = logging.getLogger(__name__)
@@ -40,19 +42,19 @@ def work(config: GridConfig, root: Path) -> CellState:
         Its state. An error of the run is a state too: it ends this cell, not the grid.
 
     Raises:
-        ConfigError: if the code has uncommitted changes, unless ``allow_dirty``, and if the cell
-            is there of other settings, as when a default has changed since.
+        ConfigError: if the code is not that of a commit, unless ``allow_dirty``; if the cell is
+            there of other settings, as when a default has changed since; and for a proof, if the
+            cell is there, or was begun, of another commit.
         KeyboardInterrupt: if a signal asked the run to stop; its checkpoint is written.
     """
-    if not config.allow_dirty and describe_origin(config.seed)["dirty"]:
-        raise ConfigError(
-            "allow_dirty",
-            "expected a tree without uncommitted changes, or allow_dirty=true for a trial.",
-        )
+    if not config.allow_dirty:
+        check_committed()
     files = config.files(root)
     if not (is_done(files) and is_whole(files)):
         with claim(files.lock, config.claim_wait) as ours:
             # Only now: another process may have finished the cell, or failed at it, meanwhile.
+            if ours:
+                _check_proof(config, files)
             if ours and is_done(files):
                 if not is_whole(files):
                     keep(files)
@@ -60,6 +62,8 @@ def work(config: GridConfig, root: Path) -> CellState:
                 with _logged(files.log):
                     _run(config, files)
     state = look(files)
+    if state.status is Status.DONE:
+        _check_proof(config, files)
     # A cell whose settings an earlier version did not fingerprint is taken as it is.
     if state.status is Status.DONE and has_fingerprint(files):
         _check_settings(config, files.kept)
@@ -78,16 +82,36 @@ def _check_settings(config: GridConfig, folder: Path) -> None:
         )
 
 
+def _check_proof(config: GridConfig, files: CellFiles) -> None:
+    """Refuse a proof of which a part, finished or only begun, was made by another commit's code."""
+    if config.proof:
+        check_sessions(files.kept)
+        if RunDirectory(files.run).is_begun:  # else it starts afresh
+            check_sessions(files.run)
+
+
+def _check_episodes(config: GridConfig, settings: Mapping[str, Any]) -> None:
+    """Refuse a run whose evaluation would play others' episodes, however it was told to."""
+    found = settings["evaluate"]["first_seed"]
+    if found != config.first_seed:
+        raise ConfigError(
+            "evaluate.first_seed",
+            f"expected {config.first_seed} with proof={str(config.proof).lower()}, got {found}.",
+        )
+
+
 def _run(config: GridConfig, files: CellFiles) -> None:
     files.failure.unlink(missing_ok=True)
     # Cells of one process share compiled code, and dynamo counts how often a function is compiled.
     torch.compiler.reset()
     try:
         request = _request(config, files)
+        _check_episodes(config, request.config.to_mapping())
         _log.info("%s", "resumed" if request.resume else "started")
         result = run(request.config, request.path, resume=request.resume)
         if result.finished:
             _check_settings(config, files.run)  # else its numbers would be kept as this cell's
+            _check_proof(config, files)
             keep(files)
             _log.info("finished")
     except Exception as error:
@@ -97,8 +121,10 @@ def _run(config: GridConfig, files: CellFiles) -> None:
             "traceback": traceback.format_exc(),
             "host": socket.gethostname(),
             "when": datetime.now().astimezone().isoformat(timespec="seconds"),
+            "commit": source_commit(),
         }
         files.failure.write_text(json.dumps(record, indent=2) + "\n")
+        keep_failure(files, record)
         return
     if not result.finished:
         _log.info("stopped by signal %s", result.signal)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
@@ -34,7 +35,10 @@ def test_the_script_runs_a_grid_shows_it_and_skips_it(
     assert "2 cells: 2 done" in shown
     assert "phihp   cartpole  200      default  done" in shown
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "results").rglob("*.json")}
-    assert len(kept) == 2 * 4
+    assert len(kept) == 2 * 4 + 1
+    names = ["cartpole-default-n200-seed0", "pendulum-default-n80-seed0"]
+    planned = tmp_path / "results" / "runs" / "planned.json"
+    assert json.loads(planned.read_text()) == sorted(names)
     run_script("run_grid", *arguments)
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "results").rglob("*.json")} == kept
     # One more cell, which fails, and the exit code says so.
@@ -50,6 +54,8 @@ def test_the_script_runs_a_grid_shows_it_and_skips_it(
     shown = capsys.readouterr().out
     assert "cartpole-default-n2500-seed0 failed: " in shown
     assert "retry_failed=true" in shown
+    assert json.loads(planned.read_text()) == sorted([*names, "cartpole-default-n2500-seed0"])
+    assert (planned.parent / "cartpole-default-n2500-seed0" / "failure.json").is_file()
 
 
 @pytest.mark.parametrize(
@@ -70,6 +76,16 @@ def test_a_wrong_grid_is_one_sentence_and_no_run(
     with pytest.raises(SystemExit, match=f"^error: {message}"):
         run_script("run_grid", *arguments)
     assert not (tmp_path / "outputs").exists()
+
+
+def test_code_without_a_commit_is_refused_before_anything_is_planned(
+    run_script: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("grid.committed.ask_git", lambda *_: None)
+    with pytest.raises(SystemExit, match=r"^error: allow_dirty: expected "):
+        run_script("run_grid", "task=pendulum")
+    assert not (tmp_path / "outputs").exists()
+    assert not (tmp_path / "results").exists()
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -9,8 +10,9 @@ from pathlib import Path
 import pytest
 from grid_cells import YAML
 
-from grid import Cell, GridConfig, LiveTable, Status, look, swept_cells
+from grid import Cell, CellFiles, GridConfig, LiveTable, Status, look, swept_cells
 from grid.display import summary, table
+from grid.keep import keep_names
 from phihp_torchrl.config import ConfigError
 
 
@@ -39,6 +41,18 @@ def test_the_table_has_a_row_for_each_setting(config: GridConfig) -> None:
         states[files] = look(files)
     assert table(states)[1:] == ["phihp   pendulum  60       default  waiting  waiting"]
     assert summary([*states.values()]) == "2 cells: 2 waiting"
+
+
+def test_the_planned_cells_of_all_commands_are_noted(config: GridConfig, tmp_path: Path) -> None:
+    def cells(*seeds: int, **changes: str) -> list[CellFiles]:
+        return [replace(config, seed=seed, **changes).files(Path()) for seed in seeds]
+
+    elsewhere = cells(7, results=str(tmp_path / "elsewhere"))
+    keep_names([*cells(1, 0), *elsewhere])
+    keep_names(cells(2, 1))
+    names = [files.cell.name for files in cells(0, 1, 2)]
+    assert json.loads((Path(config.results) / "planned.json").read_text()) == names
+    assert len(json.loads(elsewhere[0].planned.read_text())) == 1
 
 
 def test_workers_get_a_table_that_shows_nothing() -> None:

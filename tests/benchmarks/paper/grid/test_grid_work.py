@@ -17,7 +17,7 @@ import pytest
 from forked import Forks
 from grid_cells import PAPER, TINY, do, returns, words
 
-from grid import GridConfig, Status, claim, is_claimed, keep, look, work
+from grid import GridConfig, Status, claim, is_claimed, keep, look
 from grid.display import failures
 from measures import read_curve
 from phihp_torchrl.config import ConfigError
@@ -46,7 +46,8 @@ def test_a_cell_is_run_once_and_what_is_small_is_kept(config: GridConfig) -> Non
         "cell.json", "config.yaml", "curve.csv", "evaluation.json", "metadata.json", "metrics.csv",
         "prediction.json",
     }  # fmt: skip
-    assert json.loads((files.kept / "cell.json").read_text())["samples"] == 60
+    cell = json.loads((files.kept / "cell.json").read_text())
+    assert (cell["samples"], cell["proof"]) == (60, False)
     curve = read_curve(files.kept / "curve.csv")
     assert [point.acting for point in curve] == ["actor", "actor", "planner", "actor"]
     assert {point.real_steps for point in curve} == {60}
@@ -129,10 +130,10 @@ def test_a_finished_cell_of_other_settings_is_refused(finished: GridConfig) -> N
 
 
 def test_a_run_of_other_settings_is_not_kept_as_a_cell(
-    finished: GridConfig, monkeypatch: pytest.MonkeyPatch
+    finished: GridConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("grid.worker.configuration_hash", lambda settings: "another default")
-    elsewhere = replace(finished, results="elsewhere")
+    elsewhere = replace(finished, results=str(tmp_path / "elsewhere"))
     state = do(elsewhere)
     assert state.status is Status.FAILED
     assert "run of the present settings" in state.detail
@@ -184,8 +185,12 @@ def test_a_failed_cell_is_reported_and_run_again_on_request_alone(config: GridCo
     assert failures({files: state}) == [
         f"{files.cell.name} failed: {state.detail} (see {files.log})"
     ]
+    kept = json.loads((files.kept / "failure.json").read_text())
+    assert kept.keys() == {"error", "when", "commit"}
+    assert kept["error"] == state.detail
     assert do(replace(config, retry_failed=True)).status is Status.DONE
     assert not files.failure.exists()
+    assert not (files.kept / "failure.json").exists()
 
 
 def test_a_cell_goes_on_with_its_own_settings_alone(finished: GridConfig) -> None:
@@ -262,23 +267,6 @@ def test_a_killed_cell_goes_on_and_ends_as_if_it_had_not_been(
     with (config.files(Path()).kept / "metrics.csv").open() as file:
         units = [int(row["unit"]) for row in csv.DictReader(file)]
     assert units == list(range(len(units)))
-
-
-def test_code_that_no_commit_has_is_refused(
-    config: GridConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("grid.worker.describe_origin", lambda seed: {"dirty": True})
-    with pytest.raises(ConfigError, match=r"allow_dirty: expected a tree without uncommitted"):
-        work(replace(config, allow_dirty=False), Path())
-    assert not config.files(Path()).run.exists()
-
-
-def test_a_proof_plays_the_episodes_that_are_kept_for_it(config: GridConfig) -> None:
-    proof = replace(config, allow_dirty=False, proof=True)
-    assert "evaluate.first_seed=2000000" in proof.words()
-    assert not any(word.startswith("evaluate.first_seed") for word in config.words())
-    with pytest.raises(ConfigError, match=r"allow_dirty: expected false with proof=true"):
-        replace(config, proof=True)
 
 
 def test_a_cell_that_failed_at_its_start_can_be_corrected(
