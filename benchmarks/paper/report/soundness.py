@@ -10,8 +10,6 @@ from report.runs import Run
 from report.sections import Section
 from report.tables import Table, TableCell
 
-"""Smaller training seeds are for tuning; a report is on this and later ones."""
-
 
 def soundness(runs: Iterable[Run]) -> Section:
     """A row for each cell whose runs do not fit together, or that no commit can make again."""
