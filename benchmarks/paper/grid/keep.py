@@ -19,7 +19,6 @@ from grid.claim import claim
 from measures import configuration_hash, curve_from_metrics, prediction_errors, write_curve
 from phihp_torchrl.deployment import Agent, load_agent
 from phihp_torchrl.evaluation import PROOF_SEED
-from phihp_torchrl.trainers.files import write_atomically
 from phihp_torchrl.worlds import SimulatedWorld, make_world
 
 _log = logging.getLogger(__name__)
@@ -62,7 +61,7 @@ def keep_failure(files: CellFiles, record: Mapping[str, Any]) -> None:
     """
     files.kept.mkdir(parents=True, exist_ok=True)
     short = {key: record[key] for key in ("error", "when", "commit")}
-    write_atomically(files.kept_failure, json.dumps(short, indent=2) + "\n")
+    files.kept_failure.write_text(json.dumps(short, indent=2) + "\n")
 
 
 def keep_names(cells: Sequence[CellFiles]) -> None:
@@ -78,7 +77,7 @@ def keep_names(cells: Sequence[CellFiles]) -> None:
                 continue
             place.planned.parent.mkdir(parents=True, exist_ok=True)
             planned = sorted(names | set(before))
-            write_atomically(place.planned, json.dumps(planned, indent=2) + "\n")
+            place.planned.write_text(json.dumps(planned, indent=2) + "\n")
 
 
 def fingerprint(folder: Path) -> str:
