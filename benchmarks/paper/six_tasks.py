@@ -22,6 +22,7 @@ from statistics import median
 
 from measures import agent_in, paired_difference_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, markdown_table
+from report.cells import configurations
 from report.overview import origins, put_between
 from report.runs import Run, read_runs
 
@@ -106,17 +107,20 @@ def row(task: str, runs: Sequence[Run]) -> list[str]:
 
 
 def page(runs: Sequence[Run]) -> str:
-    """The results as a page."""
+    """The results as a page.
+
+    Raises:
+        ValueError: for runs of several configurations, which have no mean in common.
+    """
     found = {task: ours(runs, task) for task in TASKS}
+    if mixed := [task for task, those in found.items() if configurations(those) > 1]:
+        raise ValueError(f"{', '.join(mixed)}: expected runs of one configuration, got several.")
     used = [run for those in found.values() for run in those]
     header = ["task", "seeds", "real steps", "agent", "aim", "actor", "agent's chatter",
               "actor's chatter", "s to published", "s in all"]  # fmt: skip
     rows = [row(task, those) for task, those in found.items() if those]
     missing = [task for task, those in found.items() if not those]
     seeds = ", ".join(str(seed) for seed in sorted({run.seed for run in used}))
-    for task, those in found.items():
-        if len({run.configuration for run in those}) > 1:
-            raise ValueError(f"{task}: expected runs of one configuration, got several.")
     commits = ", ".join(sorted({run.commit for run in used}))
     machines = "; ".join(sorted({run.machine for run in used}))
     return (

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import shutil
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +20,7 @@ from grid.claim import claim
 from measures import configuration_hash, curve_from_metrics, prediction_errors, write_curve
 from phihp_torchrl.deployment import Agent, load_agent
 from phihp_torchrl.evaluation import PROOF_SEED
+from phihp_torchrl.trainers import write_atomically
 from phihp_torchrl.worlds import SimulatedWorld, make_world
 
 _log = logging.getLogger(__name__)
@@ -61,7 +63,7 @@ def keep_failure(files: CellFiles, record: Mapping[str, Any]) -> None:
     """
     files.kept.mkdir(parents=True, exist_ok=True)
     short = {key: record[key] for key in ("error", "when", "commit")}
-    files.kept_failure.write_text(json.dumps(short, indent=2) + "\n")
+    write_atomically(files.kept_failure, json.dumps(short, indent=2) + "\n")
 
 
 def keep_names(cells: Sequence[CellFiles]) -> None:
@@ -69,15 +71,16 @@ def keep_names(cells: Sequence[CellFiles]) -> None:
 
     With it a report can say how many of the planned cells there are, and which are missing.
     """
-    for place in {files.planned: files for files in cells}.values():
-        names = {files.cell.name for files in cells if files.planned == place.planned}
-        with claim(place.runs / f"{place.planned.name}.lock", wait=60.0):
-            before = json.loads(place.planned.read_text()) if place.planned.is_file() else []
+    named = defaultdict[tuple[Path, Path], set[str]](set)
+    for files in cells:
+        named[files.planned, files.runs].add(files.cell.name)
+    for (planned, runs), names in named.items():
+        with claim(runs / f"{planned.name}.lock", wait=60.0):
+            before = json.loads(planned.read_text()) if planned.is_file() else []
             if names <= set(before):
                 continue
-            place.planned.parent.mkdir(parents=True, exist_ok=True)
-            planned = sorted(names | set(before))
-            place.planned.write_text(json.dumps(planned, indent=2) + "\n")
+            planned.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(planned, json.dumps(sorted(names.union(before)), indent=2) + "\n")
 
 
 def fingerprint(folder: Path) -> str:

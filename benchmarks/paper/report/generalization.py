@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from measures import PREDICTION_STEPS
+from measures import PREDICTION_STEPS, agent_in
+from report.cells import cells
 from report.results import Results
 from report.runs import Run
 from report.sections import Picture, Section
@@ -23,13 +24,13 @@ def generalization(results: Results) -> Section:
     }
     rows: list[list[TableCell]] = []
     for (task, kind), runs in groups.items():
-        cells = sorted({(run.method, run.samples) for run in runs})
-        for method, samples in cells or [("–", 0)]:
-            these = [run for run in runs if (run.method, run.samples) == (method, samples)]
-            errors = tuple(run.prediction[_ERROR] for run in these)
-            returns = tuple(map(final, these))
-            name = f"{task}, {KINDS[kind]}"
-            rows.append([name, method, f"{samples:,}", Stat(errors, 5), Stat(returns)])
+        name = f"{task}, {KINDS[kind]}"
+        for (_, method, samples), cell in cells(runs).items():
+            errors = tuple(run.prediction[_ERROR] for run in cell)
+            returns = Stat(tuple(map(final, cell)))
+            rows.append([name, method, f"{samples:,}", Stat(errors, 5), returns])
+        if not runs:
+            rows.append([name, "–", "–", Stat(()), Stat(())])
     header = ["task, model", "method", "real samples", "error", "return"]
     columns = 4
     lines = -(-len(results.tasks) // columns)
@@ -65,5 +66,5 @@ def measured(results: Results, task: str, kind: str) -> Sequence[Run]:
 
 
 def final(run: Run) -> float:
-    """The return of a run, of its planner if it has one."""
-    return (run.acting.get("planner") or next(iter(run.acting.values()))).mean
+    """The return of a run's agent, of its planner if it has one."""
+    return run.acting[agent_in(run.acting)].mean
