@@ -54,9 +54,18 @@ class Context:
 
     @property
     def planner(self) -> SearchConfig | None:
-        """Settings of the planner, with what phases changed, such as the critics' discount."""
+        """Settings of the planner: its own, and what phases found where it has the default.
+
+        So it discounts rewards as the critics do that value its end, unless its ``gamma`` is set.
+        """
         planner = self.config.planner
-        changes: dict[str, Any] = {}
-        for phase in self.before.values():
-            changes |= getattr(phase, "planner_changes", {})
-        return planner if planner is None or not changes else replace(planner, **changes)
+        if planner is None:
+            return None
+        default = type(planner)()
+        changes = {
+            name: value
+            for phase in self.before.values()
+            for name, value in getattr(phase, "planner_changes", {}).items()
+            if getattr(planner, name) == getattr(default, name)
+        }
+        return replace(planner, **changes)

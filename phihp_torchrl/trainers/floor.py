@@ -32,7 +32,8 @@ class Floor:
     leaves one at the floor that only passes the goal, again and again, or from starts that all are
     alike. So an actor that gains a tenth of what the best states give for as long as an episode
     lasts is at the floor too. A reward that ends the episode is no state to stay in, and does not
-    count there.
+    count there. From a start that already lies in the best states nobody can gain anything, so such
+    starts tell nothing and are left out, as long as others are left.
 
     Args:
         world_model: the model, in the units of the trained networks.
@@ -92,12 +93,13 @@ class Floor:
                 self.most = steps * kept.quantile(1.0 - _BEST) - self.returns
 
     def share(self, returns: Tensor) -> float:
-        """The share of starts at the floor, for an actor's returns ``[N]`` from the same starts."""
+        """The share of telling starts at the floor, for returns ``[N]`` from the same starts."""
         # What left the finite numbers has gained nothing.
         gain = torch.where(returns.isfinite(), returns, -torch.inf) - self.returns
         least = max(self.noise, _LITTLE * float(gain.max()), 0.0)
-        passing = gain <= _PASSING * self.most
-        return float(((gain <= least) | passing).double().mean())
+        stays = (gain <= least) | (gain <= _PASSING * self.most)
+        telling = self.most > least
+        return float((stays[telling] if telling.any() else stays).double().mean())
 
 
 def _finite(returns: Tensor) -> Tensor:

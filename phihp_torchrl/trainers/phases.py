@@ -20,9 +20,10 @@ class Phase(Protocol):
     later phases go on, where the phase has found out more of its task; and an attribute ``keep``,
     which the run sets to a function that saves a checkpoint, for the phase to call within a unit of
     work when it has what must not be lost.
-    An attribute ``planner_changes`` has settings of the planner that go with its parts, and
-    ``summary`` plain values for the record of the run. A method ``trained`` returns the tensors
-    that it trains, by name: a run stops when one of them leaves the finite numbers.
+    An attribute ``planner_changes`` has settings of the planner that go with its parts and hold
+    where the planner has the defaults, and ``summary`` plain values for the record of the run. A
+    method ``trained`` returns the tensors that it trains, by name: a run stops when one of them
+    leaves the finite numbers.
 
     Examples:
         >>> class Count:

@@ -145,9 +145,8 @@ class PolicySearch:
 
     @property
     def planner_changes(self) -> dict[str, float]:
-        """What the planner has to take over: the discount of critics that a strategy has found."""
-        gamma = self._kept().gamma
-        return {} if gamma == self.config.td3.gamma else {"gamma": gamma}
+        """Settings for the planner: the discount of the kept critics."""
+        return {"gamma": self._kept().gamma}
 
     @property
     def summary(self) -> dict[str, Any]:

@@ -5,18 +5,23 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from phihp_torchrl import Box, HybridDynamics, get_task
+from phihp_torchrl import Box, HybridDynamics, System, get_task, make_world
 from phihp_torchrl.agents import RefitConfig, TD3Config
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.dynamics import TaskWorldModel
+from phihp_torchrl.imagination import Rollouts
+from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.tasks import Task
-from phihp_torchrl.trainers import PolicyConfig, PolicySearch, PolicyTrainer
+from phihp_torchrl.trainers import PolicyConfig, PolicySearch, PolicyTrainer, RunConfig
+from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.floor import Floor
+from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.trainers.strategies import STRATEGIES, strategies_of
 
 TINY = PolicyConfig(
@@ -90,7 +95,7 @@ def test_an_actor_above_the_floor_ends_the_search(monkeypatch: pytest.MonkeyPatc
     rows = run(phase)
     assert [row["policy/strategy"] for row in rows] == [0, 0, 1, 1, 1, 1]
     assert phase.summary == {"tried": ["as-set", "goal"], "kept": "goal", "at_floor": False}
-    assert phase.planner_changes == {"gamma": math.exp(-0.5)}  # the critics' discount
+    assert phase.planner_changes == {"gamma": math.exp(-0.5)}
 
 
 def test_the_search_goes_on_while_the_actor_that_earns_most_is_at_the_floor(
@@ -240,3 +245,49 @@ def test_gradients_are_tried_where_the_model_is_smooth() -> None:
 def test_unknown_strategies_are_refused(strategies: Any) -> None:
     with pytest.raises(ConfigError, match="strategies: expected"):
         strategies_of(replace(TINY, strategies=strategies))
+
+
+class Slider(System):
+    state_names, action_names = ("x", "x_dot"), ("force",)
+    velocity_of = {"x": "x_dot"}
+
+    def prior(self, state, action, constants):
+        return torch.stack([state[..., 1], action[..., 0]], -1)
+
+
+@torch.no_grad()
+def test_starts_that_leave_nothing_to_gain_hide_no_skill() -> None:
+    task = Task(
+        name="slider",
+        system=Slider(),
+        action_high=(1.0,),
+        time_step=0.05,
+        max_steps=200,
+        reset=Box.around((0.0, 0.0), (1.0, 0.1)),
+        reward=lambda state, action, next_state: -next_state.square().sum(-1),
+    )
+    model = TaskWorldModel(task, HybridDynamics.hybrid(task))
+    states = task.reset.sample([64], generator=torch.Generator().manual_seed(0))
+    wide = task.reset.sample([4096], generator=torch.Generator().manual_seed(1))
+    floor = Floor(model, states, 200, seed=0, wide=wide)
+    regulator, idle = (
+        Rollouts(model, policy, 200).returns([], states, 200).total
+        for policy in (
+            lambda weights, observed, bounds: bounds.clip(-observed.sum(-1, keepdim=True)),
+            lambda weights, observed, bounds: torch.zeros_like(observed[:, :1]),
+        )
+    )
+    assert floor.share(regulator) < 0.15
+    assert floor.share(idle) == 1.0
+
+
+@pytest.mark.parametrize(("gamma", "planned"), [(0.99, 0.9), (0.8, 0.8)])
+def test_the_planner_discounts_as_its_critics_do_unless_it_is_told_otherwise(
+    tmp_path: Path, gamma: float, planned: float
+) -> None:
+    phase = search(sparse(never), replace(TINY, td3=replace(TINY.td3, gamma=0.9)))
+    config, world = RunConfig("pendulum", planner=CEMConfig(gamma=gamma)), make_world("pendulum")
+    settings, before = config.section("policy"), {"policy": phase}
+    context = Context(config, settings, world.task, world, before, RunDirectory(tmp_path))
+    assert context.planner is not None
+    assert context.planner.gamma == planned
