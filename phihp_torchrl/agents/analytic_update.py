@@ -40,7 +40,8 @@ class Draws(NamedTuple):
     """All random numbers of an update, drawn outside its graphs so that seeds reproduce."""
 
     start_states: Tensor
-    """The state from which a world continues if its episode ends there, ``[H, N, n]``."""
+    """The state from which a world continues if its episode ends there, ``[H, N, n]``; its
+    references and inputs are those after the step in any case."""
     noise: Tensor
     """Noise before the actor's tanh, ``[H, N, m]``."""
     order: Tensor
@@ -181,8 +182,12 @@ class AnalyticUpdate(ActorCriticUpdate):
         bounds: ActionBounds,
     ) -> tuple[Batch, Tensor]:
         step = imagine_step(self.world_model, actor, state, noise, bounds)
-        batch = Batch(state, step.action, step.reward, step.next_state, step.terminated)
-        return batch, torch.where(step.terminated.unsqueeze(-1), start, step.next_state)
+        following, task = step.next_state, self.world_model.task
+        if task.outside:  # moved by no action, so gradients are what they would be without
+            signals = task.split(start)[1][..., : task.outside.size]
+            following = task.with_signals(following, signals)
+        batch = Batch(state, step.action, step.reward, following, step.terminated)
+        return batch, torch.where(step.terminated.unsqueeze(-1), start, following)
 
     def _evaluate(
         self,

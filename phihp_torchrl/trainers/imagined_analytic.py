@@ -25,8 +25,8 @@ class ImaginedAnalytic(ReplayTrainer):
     """Learns by the gradients of imagined returns through the model.
 
     All worlds go on from one update to the next; those that have reached the largest age start
-        anew between two of them. References and inputs stay during an episode as they were at its
-    start. The transitions are kept for the fit of the critics to returns.
+    anew between two of them. References and inputs are drawn for each world and go on through all
+    its lives, as in TD3's. The transitions are kept for the fit of the critics to returns.
 
     Args:
         imagination: model, rollouts, start states and settings.
@@ -45,7 +45,7 @@ class ImaginedAnalytic(ReplayTrainer):
             loss, model, config.analytic, config.td3.gamma, compile=imagination.compile
         )
         self.replay = imagination.new_replay()
-        self.worlds = imagination.new_worlds(self.generator)
+        self.enter(imagination.new_worlds(self.generator))
 
     @property
     def imagined_steps(self) -> int:
@@ -88,8 +88,11 @@ class ImaginedAnalytic(ReplayTrainer):
     def _draw(self, scale: float) -> Draws:
         steps, worlds = self.config.analytic.horizon, self.config.num_worlds
         noise = torch.randn([steps, worlds, self.task.action_dim], generator=self.generator)
+        starts = self.start_states.sample([steps, worlds], self.generator)
+        if self.stream is not None:
+            starts = self.task.with_signals(starts, self.stream.advance(steps))
         return Draws(
-            self.start_states.sample([steps, worlds], self.generator),
+            starts,
             scale * self.config.analytic.noise * noise,
             torch.randperm(steps * worlds, generator=self.generator),
         )
@@ -101,6 +104,8 @@ class ImaginedAnalytic(ReplayTrainer):
             age = torch.where(ended, 0, age + 1)
         old = age >= self.max_age
         start = self.start_states.sample([len(age)], self.generator)
+        if self.stream is not None:
+            start = self.task.with_signals(start, self.stream.present())
         self.worlds = Worlds(torch.where(old.unsqueeze(-1), start, state), torch.where(old, 0, age))
 
 

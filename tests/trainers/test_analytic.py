@@ -13,7 +13,8 @@ import torch
 from phihp_torchrl import HybridDynamics
 from phihp_torchrl.agents import AnalyticConfig, RefitConfig
 from phihp_torchrl.config import ConfigError, to_mapping
-from phihp_torchrl.trainers import LEARNERS, PolicyConfig, register_learner
+from phihp_torchrl.tasks import Signal
+from phihp_torchrl.trainers import LEARNERS, PolicyConfig, PolicyTrainer, register_learner
 from phihp_torchrl.worlds import SimulatedWorld
 
 from .trainer_parts import PENDULUM, POLICY, assert_same_state, plain, policy_trainer
@@ -73,6 +74,41 @@ def test_old_lives_start_anew():
     ended[2] = True
     trainer.learner._go_on(before.state, ended.flatten())
     assert (trainer.learner.worlds.age == 1).all()
+
+
+def following() -> PolicyTrainer:
+    """A trainer whose task has a reference that moves."""
+
+    def towards(state, action, next_state, reference):
+        return -(next_state[..., 0] - reference[..., 0]).square()
+
+    aim = Signal(("theta",), (-1.0,), (1.0,), preview=1)
+    task = replace(PENDULUM, reference=aim, reward=towards)
+    torch.manual_seed(0)
+    return PolicyTrainer(task, HybridDynamics.hybrid(task), ANALYTIC, seed=0)
+
+
+def test_references_go_on_through_all_lives():
+    trainer = following()
+    learner, stream = trainer.learner, copy.deepcopy(trainer.learner.stream)
+    signals = torch.cat([stream.present()[None], stream.advance(12)])
+    learner.learn(6)  # three rounds of four steps
+    rows = learner.replay.rows[: len(learner.replay)].split(learner.replay.sizes, -1)
+    outside = trainer.task.outside
+    for part, expected in ((rows[0], signals[:-1]), (rows[3], signals[1:])):
+        state = part.view(12, ANALYTIC.num_worlds, -1)
+        torch.testing.assert_close(state[..., -outside.size :], expected)
+    torch.testing.assert_close(learner.worlds.state[:, -outside.size :], signals[-1])
+    assert (signals.std(0) > 0).any(0).all()  # they moved
+    assert (learner.worlds.age < 7).all()
+
+
+def test_a_resumed_run_meets_the_same_references():
+    whole, resumed = following(), following()
+    whole.advance()
+    resumed.load_state_dict(copy.deepcopy(whole.state_dict()))
+    assert whole.advance()["policy/imagined_return"] == resumed.advance()["policy/imagined_return"]
+    assert torch.equal(whole.learner.worlds.state, resumed.learner.worlds.state)
 
 
 def test_critics_are_fitted_to_the_returns_for_the_planner():
