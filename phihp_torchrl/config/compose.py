@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import lru_cache
@@ -157,10 +157,18 @@ def _explain(
         known_keys = flatten(composed)
         for key in lines:
             if key not in (*_GROUPS, *known_keys) and not key.startswith(("hydra", "world.")):
-                close = get_close_matches(key, known_keys, n=1)
+                close = _close(key, known_keys)
                 hint = f"did you mean {close[0]!r}?" if close else "phihp train --cfg job has all."
                 return ConfigError(key, f"unknown key; {hint}")
     return ConfigError("settings", " ".join(str(error).split()))
+
+
+def _close(key: str, known: Iterable[str]) -> list[str]:
+    """The known key that was meant: of the same last name, in seconds or in steps, or alike."""
+    stem = key.removesuffix("_seconds")
+    last = stem.rpartition(".")[2]
+    same = [name for name in known if name.rpartition(".")[2] == last]
+    return get_close_matches(stem, same, n=1, cutoff=0.0) or get_close_matches(key, known, n=1)
 
 
 def finish(composed: Any, overrides: Sequence[str]) -> dict[str, Any]:

@@ -31,6 +31,7 @@ class _Found(NamedTuple):
 
     name: str
     score: float
+    imagined: float
     gamma: float
     layers: list[Tensor]
     actor_layers: int
@@ -125,6 +126,8 @@ class PolicySearch:
         if at_end or (half and len(self.ways) > 1):
             self._checked_half = True
             metrics |= self._check(at_end)
+        if self.over:  # not what the last way had found
+            metrics["policy/best_imagined_return"] = self._kept().imagined
         return metrics
 
     def parts(self) -> dict[str, Any]:
@@ -174,6 +177,7 @@ class PolicySearch:
                 else {
                     "name": best.name,
                     "score": best.score,
+                    "imagined": best.imagined,
                     "gamma": best.gamma,
                     "layers": list(best.layers),
                     "actor_layers": best.actor_layers,
@@ -194,9 +198,9 @@ class PolicySearch:
             self.tried, self.spent = search["tried"], search["spent"]
             self.over, self.stuck = search["over"], search["stuck"]
             self._checked_half = search["checked_half"]
-            self.best = (
-                None if best is None else _Found(**{**best, "scales": Scales(**best["scales"])})
-            )
+            if best is not None:  # older checkpoints do not say what was logged
+                scales = Scales(**best["scales"])
+                self.best = _Found(**{"imagined": best["score"], **best, "scales": scales})
             if self.tried:
                 self.trainer = self.make(self.ways[self.tried][1])
         self.trainer.load_state_dict(state)
@@ -296,7 +300,10 @@ class PolicySearch:
         trainer = self.trainer
         layers = [layer.clone() for layer in trainer.best]
         gamma = trainer.config.td3.gamma
-        return _Found(self.way, score, gamma, layers, len(trainer.update.actor), trainer.scales)
+        return _Found(
+            self.way, score, trainer.best_return, gamma, layers, len(trainer.update.actor),
+            trainer.scales,
+        )  # fmt: skip
 
     def _kept(self) -> _Found:
         return self.best if self.over and self.best is not None else self._present(-math.inf)

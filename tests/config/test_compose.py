@@ -305,6 +305,11 @@ def composed() -> Any:
     ("override", "message"),
     [
         ("policy.updatez=3", "policy.updatez: unknown key; did you mean 'policy.updates'?"),
+        (
+            "policy.td3.gamma_seconds=2",
+            "policy.td3.gamma_seconds: unknown key; did you mean 'policy.td3.gamma'?",
+        ),
+        ("policy.gamma=0.9", "policy.gamma: unknown key; did you mean 'policy.td3.gamma'?"),
         ("qqqqqq.z=3", "qqqqqq.z: unknown key;"),
         ("task=nonsense", "task: expected one of ['acrobot', "),
         ("preset=nonsense", "preset: expected one of ['default', 'paper'], got 'nonsense'."),

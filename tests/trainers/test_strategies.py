@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from dataclasses import replace
@@ -21,6 +22,7 @@ from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers import PolicyConfig, PolicySearch, PolicyTrainer, RunConfig
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.floor import Floor
+from phihp_torchrl.trainers.policy_evaluation import ActorEvaluation
 from phihp_torchrl.trainers.run_directory import RunDirectory
 from phihp_torchrl.trainers.strategies import STRATEGIES, strategies_of
 
@@ -112,6 +114,25 @@ def test_the_search_goes_on_while_the_actor_that_earns_most_is_at_the_floor(
     tried = ["as-set", "goal", "analytic"]
     assert phase.summary == {"tried": tried, "kept": "analytic", "at_floor": False}
     assert "Strategy 'goal' earns less after 8 updates than one" in caplog.text
+
+
+def test_the_best_return_at_the_end_is_that_of_the_actor_that_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    falling = itertools.count(-1.0, -1.0)
+    monkeypatch.setattr(ActorEvaluation, "mean", lambda self, returns: next(falling))
+    monkeypatch.setattr(
+        PolicySearch, "_returns", lambda self, *_: torch.full((8,), -float(self.tried))
+    )
+    monkeypatch.setattr(Floor, "share", lambda self, returns: 1.0)
+    phase = search(sparse(never))
+    best = [row["policy/best_imagined_return"] for row in run(phase)]
+    assert phase.summary["kept"] == "as-set"
+    assert best[:2] == [-1.0, -1.0]
+    assert best[-2] < best[-1] == -1.0
+    resumed = search(sparse(never))
+    resumed.load_state_dict(phase.state_dict())
+    assert resumed._kept().imagined == -1.0
 
 
 def test_skill_near_the_goal_is_given_time_to_spread(monkeypatch: pytest.MonkeyPatch) -> None:
