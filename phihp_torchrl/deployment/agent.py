@@ -226,13 +226,15 @@ class Agent(TensorDictModuleBase):
         return self._warm_up
 
     def reset(self) -> None:
-        """Drop the previous plan and what is under way, at the start of an episode."""
+        """Drop the previous plan, what is under way and the actor's memory, as an episode starts.
+
+        An actor has a memory if it has a function ``reset()``, as a controller with an integral.
+        """
         if self._warm_up is not None and self._warm_up.take():
             self._warm_up = None
-        if self.planner is not None:
-            self.planner.reset()
-        if self._memory is not None:
-            self._memory.reset()
+        for part in (self.planner, self._memory, self.actor):
+            if callable(reset := getattr(part, "reset", None)):
+                reset()
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy, or another process, does not wait for what is compiled for this one.

@@ -13,13 +13,15 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, is_whole
 from phihp_torchrl.deployment.control_report import ControlReport, Tally
 from phihp_torchrl.deployment.deadline import DeadlineWorker
+from phihp_torchrl.deployment.entries import Entries, as_numbers
 from phihp_torchrl.deployment.fallback import Fallback, FallbackChain
 from phihp_torchrl.deployment.observer import VelocityObserver
+from phihp_torchrl.deployment.own_check import OwnCheck
 from phihp_torchrl.deployment.safety import Checks, Safety
 from phihp_torchrl.deployment.under_way import COMPLETE, UnderWay
 from phihp_torchrl.tasks import Task, find_task
@@ -54,13 +56,17 @@ class Controller:
             ``[o]`` as it was measured that returns an action ``[m]``, or ``None`` to pass. The last
             resort is always rest. Defaults to the actor, if the agent plans and has one, and then
             to the last action.
-        accept: a check of your own, of observation and action; false refuses the action.
+        accept: a check of your own, of observation and action; false refuses the action, and so
+            does an error that it raises, of which the first is logged.
+        dynamics: the model, on the agent's device, by which a disturbance of the task is estimated.
+            Defaults to the agent's; an exported agent has none.
         observer: completes states whose velocities are not measured; :meth:`step` is then given
             physical states ``[n]`` with NaN for what is not measured.
         clock: a function that returns the time in seconds; timestamps are of this clock.
 
     Raises:
-        ConfigError: for limits or a fallback that do not fit the agent and its task.
+        ConfigError: for limits or a fallback that do not fit the agent and its task, and for a task
+            with a disturbance where neither the agent nor ``dynamics`` is a model.
 
     Examples:
         >>> from phihp_torchrl import Agent, get_task
@@ -84,6 +90,7 @@ class Controller:
         safety: Safety | None = None,
         fallback: Fallback | Sequence[Fallback] | None = None,
         accept: Accept | None = None,
+        dynamics: nn.Module | None = None,
         observer: VelocityObserver | None = None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
@@ -93,12 +100,22 @@ class Controller:
         self.agent, self.task = agent, find_task(given)
         self.safety = safety or Safety()
         self.observer = observer
-        self._accept, self._clock = accept, clock
+        for key, function in (("accept", accept), ("clock", clock)):
+            if not (callable(function) or (function is None and key == "accept")):
+                raise ConfigError(key, f"expected a function, got {function!r}.")
+        self._accept = None if accept is None else OwnCheck("accept", accept)
+        self._clock = clock
         self._checks = Checks(self.task, self.safety)
         self._chain = FallbackChain(agent, self.task, self._checks, fallback)
-        self._memory = None
-        if self.task.register_count:
-            self._memory = UnderWay(self.task, getattr(agent, "dynamics", None))
+        self._entries = Entries(agent, self.task)
+        model = getattr(agent, "dynamics", None) if dynamics is None else dynamics
+        if self.task.disturbance is not None and model is None:
+            raise ConfigError(
+                "dynamics",
+                "expected a model, by which the task's disturbance is estimated, got None, and the "
+                "agent has none (`load_agent(...).dynamics` is the one that it was made with).",
+            )
+        self._memory = UnderWay(self.task, model) if self.task.register_count else None
         self._worker = DeadlineWorker()
         self._lock = RLock()
         like = next(agent.parameters(), torch.empty(0))
@@ -128,21 +145,27 @@ class Controller:
         Args:
             observation: what was measured, ``[o]``: the observation of the system alone, or with
                 what is under way; for a controller with an observer, a state ``[n]``.
-            timestamp: when it was measured, in seconds of ``clock``.
-            inputs: further entries that the agent reads, by key.
+            timestamp: when it was measured, in seconds of ``clock``. With ``Safety.max_age`` it is
+                stale where it is older, is not a number, or is more than a time step ahead.
+            inputs: further entries that the agent reads, by key: ``reference`` and ``inputs`` of
+                the task, ``[k]``, or with their preview ``[rows, k]``, in physical units.
 
         Raises:
-            ValueError: for an observation of the wrong size, and for a reference or inputs of the
-                task that are missing where an episode starts, or of another shape.
+            ValueError: for an observation of the wrong size; for a reference or inputs of the task
+                that are missing where an episode starts, or of another shape; for an entry that is
+                no number, and for one that nobody reads.
         """
         with self._lock, torch.no_grad():
             started = self._clock()
-            measured = torch.as_tensor(observation, dtype=torch.float32).detach().cpu()
-            seen = self._complete(measured)
+            finite = self._entries.read(inputs)
+            lost = len(finite) < len(inputs)
+            measured = as_numbers("observation", observation).detach().cpu()
+            seen = self._complete(measured, finite.get("inputs"))
             reason = self._fault(seen, timestamp, started)
-            data = self._data(seen if reason is None else torch.full_like(seen, torch.nan), inputs)
+            shown = seen if reason is None else torch.full_like(seen, torch.nan)
+            data = self._data(shown, finite, lost)
             usable = None if reason else data
-            if reason is None and not all(map(_is_finite, inputs.values())):
+            if reason is None and lost:
                 reason = "inputs"
             action = None
             if reason is None:
@@ -166,7 +189,12 @@ class Controller:
 
         Returns:
             Quantiles of the time of an action after the first, in milliseconds.
+
+        Raises:
+            ConfigError: for ``calls`` that are no whole number.
         """
+        if not is_whole(calls, 0):
+            raise ConfigError("calls", f"expected a whole number >= 0, got {calls!r}.")
         with self._lock, torch.no_grad(), torch.random.fork_rng(devices=self._cuda):
             states = (self.task.coverage or self.task.reset).sample([calls + 1])
             times = []
@@ -212,7 +240,7 @@ class Controller:
 
     # One step, in its order.
 
-    def _complete(self, measured: Tensor) -> Tensor:
+    def _complete(self, measured: Tensor, inputs: Tensor | None) -> Tensor:
         """The observation ``[o]`` for what was measured."""
         system = self.task.system
         if self.observer is not None:
@@ -224,29 +252,32 @@ class Controller:
                 f"observation: expected shape [{' or '.join(map(str, sorted(sizes)))}], "
                 f"got {list(measured.shape)}."
             )
-        return measured if self.observer is None else system.observe(self.observer.update(measured))
+        if self.observer is None:
+            return measured
+        return system.observe(self.observer.update(measured, inputs))
 
     def _fault(self, seen: Tensor, timestamp: float | None, now: float) -> str | None:
         if timestamp is not None:
             last, self._stamp = self._stamp, timestamp
-            limit = self.safety.max_age
-            if (limit is not None and now - timestamp > limit) or timestamp == last:
+            age, limit = now - timestamp, self.safety.max_age
+            # NaN is not within any limits; by a step, two clocks may differ.
+            fresh = limit is None or -self.task.time_step <= age <= limit
+            if not fresh or timestamp == last:
                 return "stale"
         return self._checks.observation(seen)
 
-    def _data(self, seen: Tensor, inputs: dict[str, Any]) -> TensorDict | None:
+    def _data(self, seen: Tensor, finite: dict[str, Tensor], lost: bool) -> TensorDict | None:
         """What the agent is to read; ``None`` where a first reference or input is not finite.
 
-        Later ones that are not finite are left out, so that the last value is kept.
+        Later ones that are not finite, and so were lost, are left out: the last value is kept.
         """
         like, memory = self._like, self._memory
-        finite = {key: value for key, value in inputs.items() if _is_finite(value)}
-        entries = {key: torch.as_tensor(value).to(like) for key, value in finite.items()}
+        entries = {key: value.to(like) for key, value in finite.items()}
         data = TensorDict(observation=seen.to(like), **entries)
         if memory is not None and not memory.is_asked(data):
             memory = None
         self._remembers = memory is not None
-        if len(finite) < len(inputs) and not (memory is not None and memory.has_begun):
+        if lost and not (memory is not None and memory.has_begun):
             return None
         if memory is not None:
             data = memory.extend(data).set(COMPLETE, torch.ones(1, dtype=torch.bool))
@@ -305,7 +336,3 @@ def _act(agent: TensorDictModuleBase, data: TensorDict, last: Tensor, unheard: i
     elif unheard and hasattr(agent, "follow"):
         agent.follow(last, unheard - 1)
     return agent(data)["action"].detach().cpu()
-
-
-def _is_finite(value: Any) -> bool:
-    return bool(torch.as_tensor(value).isfinite().all())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, check_count
 from phihp_torchrl.dynamics import HybridDynamics
 from phihp_torchrl.tasks import Task
 
@@ -25,7 +25,8 @@ class VelocityObserver:
     For constant velocities these are the gains with which both errors decay as :math:`p^k`, without
     overshoot (the critically damped g-h filter; Brookner, *Tracking and Kalman Filtering Made
     Easy*, 1998). With a model, the prediction knows the command, so that the velocity does not lag
-    behind it. A position that is missing too (NaN), as after a lost packet, is predicted.
+    behind it, and the task's inputs as they are measured. A position that is missing too (NaN), as
+    after a lost packet, is predicted.
 
     Args:
         task: the task, whose system says which velocity belongs to which position.
@@ -36,7 +37,7 @@ class VelocityObserver:
         most_missing: samples in a row that may lack a position, which is predicted meanwhile.
 
     Raises:
-        ConfigError: for a system without velocities, or a smoothing out of range.
+        ConfigError: for a system without velocities, and for a number out of range.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -58,13 +59,14 @@ class VelocityObserver:
     ) -> None:
         if smoothing is None:
             smoothing = _WITHOUT_MODEL if dynamics is None else _WITH_MODEL
-        if not 0.0 <= smoothing < 1.0:
-            raise ConfigError("smoothing", f"expected a number in [0, 1), got {smoothing}.")
+        if not (isinstance(smoothing, (int, float)) and 0.0 <= smoothing < 1.0):
+            raise ConfigError("smoothing", f"expected a number in [0, 1), got {smoothing!r}.")
         names, pairs = task.system.state_names, dict(task.system.velocity_of)
         if not pairs:
             raise ConfigError("task", "expected a system with velocities, got one without.")
         self.task, self.dynamics = task, dynamics
         self.most_missing = most_missing
+        check_count(self, "most_missing", least=0)
         self._positions = [names.index(name) for name in pairs]
         self._velocities = [names.index(name) for name in pairs.values()]
         self._of_position = 1.0 - smoothing**2
@@ -79,11 +81,24 @@ class VelocityObserver:
         self._missing = 0
 
     @torch.no_grad()
-    def update(self, measured: Tensor) -> Tensor:
+    def update(self, measured: Tensor, inputs: Tensor | None = None) -> Tensor:
         """Return the state ``[n]``, physical and complete, for a measured one with NaN in it.
 
         Where there is too little to go by, some NaN stay.
+
+        Args:
+            measured: the state ``[n]`` in physical units, NaN where it is not measured.
+            inputs: the task's inputs from now on, ``[k]``, or with their preview ``[rows, k]``, in
+                physical units. Without them the last ones are kept, and at first the middle of
+                their range is taken. A task that has none does not read them.
+
+        Raises:
+            ValueError: for inputs of another shape, or not finite.
         """
+        if inputs is not None and self.task.inputs is not None:
+            registers, outside = self._under_way(measured), self.task.outside
+            own = outside.read({"inputs": inputs}, registers[: outside.size])
+            self._registers = outside.replaced(registers, own)
         predicted = self._predicted
         lost = not measured[self._positions].isfinite().all()
         self._missing = self._missing + 1 if lost else 0
@@ -109,11 +124,14 @@ class VelocityObserver:
         if state is None or not state.isfinite().all():
             self._predicted = None
             return
-        registers = self.task.rest(state) if self._registers is None else self._registers
-        acting, self._registers = self.task.acting(registers, action.to(state))
+        acting, self._registers = self.task.acting(self._under_way(state), action.to(state))
         if self.dynamics is None:
             self._predicted = state.clone()
             self._predicted[self._positions] += self.task.time_step * state[self._velocities]
         else:
             like = next(self.dynamics.parameters(), state)
             self._predicted = self.dynamics.step(state.to(like), acting.to(like)).to(state)
+
+    def _under_way(self, like: Tensor) -> Tensor:
+        """The registers ``[r]`` of the task: inputs, and commands under way."""
+        return self.task.rest(like) if self._registers is None else self._registers

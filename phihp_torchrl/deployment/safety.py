@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_count, check_positive
+from phihp_torchrl.config import INFINITE, ConfigError, check_count, check_fields, check_positive
+from phihp_torchrl.deployment.own_check import OwnCheck
 from phihp_torchrl.tasks import LastAction, Task
 from phihp_torchrl.worlds import read_guards
 
 REASONS = {
     "observation": "an observation that is not finite",
     "implausible": "an observation outside the plausible ranges, or a cosine without its sine",
-    "stale": "a sample that is too old, or the one before once more",
+    "stale": "a sample that is too old, of another clock, or the one before once more",
     "inputs": "a reference or an input that is not finite",
     "late": "no plan by the deadline",
     "error": "a plan that raised an exception",
@@ -40,21 +40,25 @@ class Safety:
         deadline: seconds from the call of ``step`` within which the agent must have acted; ``None``
             to wait for it for ever.
         plausible: by name of a state, the largest ``|value|``, or the lowest and the highest value,
-            that a sensor can report. States without an entry may have any finite value.
+            that a sensor can report, in the unit of the state. States without an entry may have any
+            finite value, and an infinite limit is none.
         mismatch: how much the cosine and the sine of an angle may contradict each other: the
             largest difference of an observation to the one of the state read from it. ``None`` for
             any.
-        max_age: seconds after which a sample is too old to act upon; ``None`` for any age.
+        max_age: seconds after which a sample is too old to act upon; ``None`` for any age. With it,
+            a time that is not a number is stale too, and one that is more than a step ahead of the
+            controller's clock, for it is of another clock.
         max_change: the largest change of each action from one step to the next, in units of the
             action: one number, or one for each. ``None`` for any.
         hold_steps: steps in a row for which the last action may be held before the motor is left
             at rest.
         constraints: whether the fallback takes over in a step whose observed state, or that state
             with the agent's action, is outside the task's constraints, hard or soft. It should be a
-            function that leads back, for neither the actor nor the last action needs to.
+            function that leads back, for neither the actor nor the last action needs to. A
+            constraint's function that raises an error is violated; the first error is logged.
 
     Raises:
-        ConfigError: for a number that is not positive.
+        ConfigError: for a value of another type, and for a number that is not positive.
 
     Examples:
         >>> Safety(deadline=0.015, plausible={"x": 2.0}).hold_steps
@@ -62,7 +66,9 @@ class Safety:
     """
 
     deadline: float | None = None
-    plausible: Mapping[str, float | tuple[float, float]] = field(default_factory=dict, hash=False)
+    plausible: Mapping[str, float | tuple[float, float]] = field(
+        default_factory=dict, hash=False, metadata=INFINITE
+    )
     mismatch: float | None = 0.05
     max_age: float | None = None
     max_change: float | tuple[float, ...] | None = None
@@ -70,16 +76,14 @@ class Safety:
     constraints: bool = False
 
     def __post_init__(self) -> None:
+        check_fields(self)
         given = [n for n in ("deadline", "mismatch", "max_age") if getattr(self, n) is not None]
         check_positive(self, *given)
         check_count(self, "hold_steps", least=0)
         if self.max_change is not None:
             change = self.max_change
-            changes = (change,) if isinstance(change, (int, float)) else change
-            if not all(0 < change < math.inf for change in changes):
-                raise ConfigError(
-                    "max_change", f"expected positive numbers, got {self.max_change!r}."
-                )
+            if not all(each > 0 for each in (change if isinstance(change, tuple) else (change,))):
+                raise ConfigError("max_change", f"expected positive numbers, got {change!r}.")
 
 
 class Checks:
@@ -119,13 +123,14 @@ class Checks:
         self._bounds = task.bounds
         self.rest = task.clip_action(torch.zeros(task.action_dim))
         change = safety.max_change
-        if isinstance(change, (tuple, list)) and len(change) != task.action_dim:
+        if isinstance(change, tuple) and len(change) != task.action_dim:
             raise ConfigError(
                 "max_change",
                 f"expected one number, or one for each of {task.system.action_names}, "
                 f"got {change!r}.",
             )
         self.change = None if change is None else torch.tensor(change).expand(task.action_dim)
+        self._keeps = OwnCheck("A constraint of the task", self._keeps_constraints)
         self._rate = LastAction(task.bounds, rate_limit=task.action_rate_limit, cost=0.0)
 
     def command(self, action: Tensor, last: Tensor) -> Tensor:
@@ -160,11 +165,11 @@ class Checks:
         return "rate" if too_far is not False and too_far.any() else None
 
     def violates(self, observation: Tensor, action: Tensor) -> bool:
-        """Whether an observation ``[o]``, or it and an action ``[m]``, violate a constraint."""
-        if not self.safety.constraints:
-            return False
-        state = self.task.system.locate(observation[: self.task.system.observation_dim])
-        return bool((self.task.limits.violations(state, self.task.clip_action(action)) > 0).any())
+        """Whether an observation ``[o]``, or it and an action ``[m]``, violate a constraint.
+
+        A constraint whose function raises an error is violated.
+        """
+        return self.safety.constraints and not self._keeps(observation, action)
 
     def towards_rest(self, last: Tensor) -> Tensor:
         """The action ``[m]`` nearest to rest (zero, in bounds) that may follow the last one."""
@@ -172,3 +177,8 @@ class Checks:
         if self.change is None:
             return rest
         return last + (rest - last).clamp(-self.change, self.change)
+
+    def _keeps_constraints(self, observation: Tensor, action: Tensor) -> Tensor:
+        state = self.task.system.locate(observation[: self.task.system.observation_dim])
+        command = self.task.clip_action(action)
+        return ~(self.task.limits.violations(state, command) > 0).any()

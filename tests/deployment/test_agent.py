@@ -12,8 +12,10 @@ from tensordict import TensorDict
 
 from phihp_torchrl import Agent, CEMPlanner, HybridDynamics, MPPIPlanner, get_task
 from phihp_torchrl.agents import Actor, make_actor
+from phihp_torchrl.baselines import LQI, PID
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
 from phihp_torchrl.worlds import SimulatedWorld
+from tests.followed import followed
 
 from .agent_parts import SMALL, act, make_agent, observations
 
@@ -95,6 +97,17 @@ def test_an_agent_forgets_its_plan_on_reset():
     agent.reset()
     assert agent.planner.receding._plans is None
     agent.actor_alone().reset()
+
+
+@pytest.mark.parametrize("kind", [LQI, PID])
+def test_an_actor_with_a_memory_forgets_it_on_reset(kind):
+    task = followed()
+    agent = Agent(task, actor=kind.from_model(task, HybridDynamics.pure_prior(task)))
+    shown = TensorDict(observation=torch.tensor([0.02, 0.0]), reference=torch.zeros(1))
+    first, second = (agent(shown.clone())["action"] for _ in range(2))
+    assert first != second  # the integral has grown
+    agent.reset()
+    assert agent(shown.clone())["action"] == first
 
 
 def test_an_agent_needs_enough_parts():

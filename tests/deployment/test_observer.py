@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from phihp_torchrl import Agent, get_task
+from phihp_torchrl import Agent, HybridDynamics, get_task
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.deployment import Controller, VelocityObserver
 from phihp_torchrl.tasks import Actuator
 from phihp_torchrl.worlds import SimulatedWorld
+from tests.followed import Mass, followed
 
 
 def follow(observer, task, noise=0.0, steps=200):
@@ -85,3 +86,46 @@ def test_what_is_measured_stays():
 def test_smoothing_out_of_range():
     with pytest.raises(ValueError, match=r"^smoothing: expected"):
         VelocityObserver(get_task("pendulum"), smoothing=1.0)
+
+
+@pytest.mark.parametrize("through", ["observer", "controller"])
+def test_the_model_predicts_with_the_inputs_that_were_measured(through):
+    """A mass in a wind of 1 to 2 N; the middle of the wind's range is 0."""
+    task = followed(Mass())
+    model = HybridDynamics.pure_prior(task)
+    observer = VelocityObserver(task, model, smoothing=0.5)
+    control = Controller(Agent(task, actor=Actor(task)), observer=observer)
+    state = torch.zeros(2)
+    for k in range(20):
+        wind, measured = torch.tensor([1.0 + k % 2]), torch.tensor([state[0], torch.nan])
+        if through == "observer":
+            found, action = observer.update(measured, wind), torch.zeros(1)
+            observer.acted(action)
+        else:
+            action = torch.tensor(control.step(measured, reference=[0.0], inputs=wind))
+            found = observer._state
+        assert torch.allclose(found, state, atol=1e-4)
+        with torch.no_grad():
+            state = model.step(state, torch.cat([action, wind]))
+
+
+def test_inputs_that_are_not_given_stay_and_wrong_ones_are_named():
+    task = followed(Mass())
+    observer = VelocityObserver(task, HybridDynamics.pure_prior(task))
+    observer.update(torch.zeros(2), torch.tensor([2.0]))
+    for speed in (0.2, 0.4):  # 2 N on 1 kg for 0.1 s each
+        observer.acted(torch.zeros(1))
+        assert observer.update(torch.full((2,), torch.nan))[1].item() == pytest.approx(speed)
+    with pytest.raises(ValueError, match=r"^inputs: expected \('wind',\) of shape \[1\]"):
+        observer.update(torch.zeros(2), torch.zeros(2))
+
+
+def test_an_input_that_is_lost_leaves_the_last_one_to_the_observer():
+    task = followed(Mass())
+    observer = VelocityObserver(task, HybridDynamics.pure_prior(task))
+    control = Controller(Agent(task, actor=Actor(task)), observer=observer, fallback="zero")
+    control.step([0.0, 0.0], reference=[0.0], inputs=[2.0])
+    control.step([0.0, 0.0], inputs=[np.nan])
+    control.step([np.nan, np.nan])
+    assert control.report().reasons == {"inputs": 1}
+    assert observer._state[1].item() == pytest.approx(0.2)
