@@ -38,6 +38,7 @@ class ExportConfig:
         states: number of states on which exported and eager actions are compared.
         tolerance: largest difference of actions that counts as equal, in units of the action's
             half-range.
+        plugins: Python files or modules to import, which register the agent's task.
     """
 
     agent: str
@@ -46,6 +47,7 @@ class ExportConfig:
     parts: tuple[str, ...] = _PARTS
     states: int = 1000
     tolerance: float = 1e-3
+    plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -70,7 +72,8 @@ def export(config: ExportConfig) -> None:
     """Write the files, check them, time them, and print a table.
 
     Raises:
-        ConfigError: for an agent that cannot be loaded or exported.
+        ConfigError: for a plugin that cannot be imported, and an agent that cannot be loaded or
+            exported.
     """
     import torch
 
@@ -85,7 +88,9 @@ def export(config: ExportConfig) -> None:
         load_agent,
     )
     from phihp_torchrl.evaluation import markdown_table
+    from phihp_torchrl.trainers import import_plugins
 
+    import_plugins(config.plugins)
     torch.set_num_threads(1)
     torch.manual_seed(0)
     try:

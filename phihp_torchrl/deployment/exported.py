@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, from_mapping
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment.export_modules import LAST, PLAN, action_of
-from phihp_torchrl.deployment.manifest import Manifest, signature_of
+from phihp_torchrl.deployment.manifest import Manifest
 from phihp_torchrl.deployment.reading import AgentError
-from phihp_torchrl.tasks import Actuator, Task, find_task
+from phihp_torchrl.deployment.saved_task import another_task, find_task, read_signature
+from phihp_torchrl.tasks import Task
 
 Act = Callable[..., Any]
 """A function from observation ``[o]``, noise and memory, as far as there are some, to an action
@@ -104,14 +104,17 @@ def load_exported(path: str | os.PathLike[str], task: str | Task | None = None) 
     """Load an exported plan or actor: an AOTInductor package (``.pt2``) or an ONNX model.
 
     The description beside the file is checked first: its digest, and for machine code the version
-    of torch and the processor. A package is native code, so load only what you trust.
+    of torch and the processor. It also has what the agent was trained with: a registered task gets
+    the actuator, the rates and the constraints from it, and has to agree in the range and preview
+    of its reference. A package is native code, so load only what you trust.
 
     Args:
         path: the file that ``phihp export`` wrote, with its description ``.json`` beside it.
-        task: the task or its name. Defaults to the registered one that the description names.
+        task: the task that it must be for, or its name. Defaults to the registered one that the
+            description names.
 
     Raises:
-        AgentError: if a file is missing or another one, or does not run here.
+        AgentError: if a file is missing or another one, is for another task, or does not run here.
         ImportError: if ONNX Runtime is not installed.
 
     Examples:
@@ -129,17 +132,23 @@ def load_exported(path: str | os.PathLike[str], task: str | Task | None = None) 
         raise AgentError(f"{path}: expected one of {list(_LOADERS)}, got {path.suffix!r}.")
     manifest = Manifest.read(path)
     manifest.check(path, machine_code=path.suffix == ".pt2")
+    task = _task_of(path, manifest, task)
+    return ExportedAgent(_LOADERS[path.suffix](path), task, manifest.noise, manifest.starts())
+
+
+def _task_of(path: Path, manifest: Manifest, wanted: str | Task | None) -> Task:
+    """The task of an exported file, with all that its agent was trained with."""
     try:
-        here = find_task(manifest.task["name"] if task is None else task)
-        actuator = from_mapping(Actuator, manifest.actuator) if manifest.actuator else None
-    except (ConfigError, KeyError) as error:
-        raise AgentError(f"{path}: {error} Register the task first, or pass it as task.") from error
-    here = replace(here, actuator=actuator)
-    signature = signature_of(here)
-    if signature != dict(manifest.task):
-        differing = sorted(k for k, v in signature.items() if manifest.task.get(k) != v)
-        raise AgentError(f"{path}: task {here.name!r} is another one here: {differing} differ.")
-    return ExportedAgent(_LOADERS[path.suffix](path), here, manifest.noise, manifest.starts())
+        signature = read_signature(manifest.task)
+    except ConfigError as error:
+        raise AgentError(f"{path}: {error}") from error
+    partial = manifest.format_version == 1
+    task = find_task(path, signature, wanted, manifest.additions, partial=partial)
+    if task.observation_dim != manifest.observation:
+        raise another_task(
+            path, task, f"observations of {manifest.observation} numbers", task.observation_dim
+        )
+    return task
 
 
 def load_aoti(path: Path) -> Act:

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from phihp_torchrl.deployment.formats import TaskSignature
 from phihp_torchrl.deployment.reading import AgentError, read_json
+from phihp_torchrl.deployment.saved_task import describe_task
 from phihp_torchrl.origin import package_version
-from phihp_torchrl.tasks import Task
 
 if TYPE_CHECKING:
     from phihp_torchrl.deployment.export_modules import ExportModule
 
 FORMAT = "phihp_torchrl export"
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,11 @@ class Manifest:
 
     Args:
         format: what sort of JSON file this is.
+        format_version: 1 has nothing of the task but its signature and its actuator.
         part: ``"plan"`` or ``"actor"``.
         task: signature of the task.
-        actuator: numbers of the task's actuator that are not those of a perfect one.
+        additions: what else an agent's file says of its task: actuator, rates, constraints, and the
+            range and preview of what comes from outside.
         observation: number of components of an observation.
         noise: shape of the noise, or ``None``.
         memory: what is kept from step to step, by the names of its inputs: the values where an
@@ -46,9 +48,10 @@ class Manifest:
     """
 
     format: str
+    format_version: int
     part: str
     task: Mapping[str, Any]
-    actuator: Mapping[str, Any]
+    additions: Mapping[str, Any]
     observation: int
     noise: tuple[int, ...] | None
     memory: Mapping[str, list[Any]]
@@ -61,13 +64,14 @@ class Manifest:
     @classmethod
     def of(cls, module: ExportModule, path: Path) -> Manifest:
         """Describe the file that was exported from a module here."""
-        task = module.task
+        additions = json.loads(json.dumps(describe_task(module.task)))
         return cls(
             format=FORMAT,
+            format_version=FORMAT_VERSION,
             part=module.part,
-            task=signature_of(task),
-            actuator={} if task.actuator is None else task.actuator.config,
-            observation=task.observation_dim,
+            task=additions.pop("task"),
+            additions=additions,
+            observation=module.task.observation_dim,
             noise=module.noise_shape,
             memory={name: _plain(value.tolist()) for name, value in module.memory.items()},
             sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -86,15 +90,25 @@ class Manifest:
         """Read the description of an exported file.
 
         Raises:
-            AgentError: if it is missing, or is not such a description.
+            AgentError: if it is missing, no such description, or of another version.
         """
         place = manifest_path(path)
         content = read_json(place)
         content.setdefault("memory", {})  # version 0.2.0 kept nothing
+        if "actuator" in content:  # version 0.2.0 again, where {} is none
+            actuator = content.pop("actuator") or None
+            content = {"format_version": 1, "additions": {"actuator": actuator}, **content}
         names = {field.name for field in fields(cls)}
+        version = content.get("format_version", FORMAT_VERSION)
+        if content.get("format") == FORMAT and version not in (1, FORMAT_VERSION):
+            raise AgentError(
+                f"{place}: expected format_version 1 or {FORMAT_VERSION}, got {version!r}."
+            )
         if content.get("format") != FORMAT or set(content) != names:
             raise AgentError(f"{place}: expected the description of an exported file, got another.")
         try:
+            content["task"] = dict(content["task"])
+            content["additions"] = dict(content["additions"])
             content["noise"] = None if content["noise"] is None else tuple(content["noise"])
             content["processor"] = tuple(content["processor"])
             content["memory"] = dict(content["memory"])
@@ -151,11 +165,6 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, list):
         return [_numbers(item) for item in value]
     return math.nan if value is None else float(value)
-
-
-def signature_of(task: Task) -> dict[str, Any]:
-    """The signature of a task as JSON has it."""
-    return json.loads(json.dumps(asdict(TaskSignature.of(task))))
 
 
 def manifest_path(path: Path) -> Path:

@@ -36,26 +36,52 @@ def read_signature(mapping: Mapping[str, Any]) -> TaskSignature:
 
 
 def find_task(
-    path: Path, signature: TaskSignature, wanted: str | Task | None, content: Mapping[str, Any]
+    path: Path,
+    signature: TaskSignature,
+    wanted: str | Task | None,
+    content: Mapping[str, Any],
+    *,
+    partial: bool = False,
 ) -> Task:
     """Return the task that an agent's file is of, with all that it was trained with.
+
+    A task that is found by its name has the actuator, the rates and the constraints of the file,
+    which a run may have set otherwise than its task does. One that is given keeps its own, and gets
+    those of the file where it has none.
 
     Args:
         path: the file, for messages.
         signature: the signature in it.
         wanted: the task that it must be for, or its name; ``None`` for the registered one.
-        content: the file's content.
+        content: what the file says besides, under the keys of :func:`describe_task`.
+        partial: whether a file without a key says nothing of it, and not that the task has none.
 
     Raises:
-        AgentError: if there is no such task here, or it is another one.
+        AgentError: if there is no such task here, or it is another one; the message has what the
+            agent was trained with as expected.
     """
-    task = _with_additions(path, _resolve(path, signature, wanted), content)
+    task = _resolve(path, signature, wanted)
+    if partial:
+        content = {**describe_task(task), **content}
+    try:
+        trained = _with_additions(task, content)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise AgentError(f"{path}: {error}") from error
+    if isinstance(wanted, Task):
+        for name in ("actuator", *_RATES, "constraints"):
+            here, there = getattr(task, name), getattr(trained, name)
+            if here not in (None, (), there):
+                raise another_task(path, task, f"its {name} {there}", here)
     if (saved := content.get("outside", {})) != (ours := _outside(task)):
-        raise AgentError(
-            f"{path}: task {task.name!r} is another one here: expected the reference, inputs and "
-            f"disturbance {saved}, got {ours}."
-        )
-    return task
+        raise another_task(path, task, f"the reference, inputs and disturbance {saved}", ours)
+    return task if trained == task else trained
+
+
+def another_task(path: Path, task: Task, expected: str, got: object) -> AgentError:
+    """The error of a task that differs from the one in a file, which is what was expected."""
+    return AgentError(
+        f"{path}: task {task.name!r} is another one here: expected {expected}, got {got}."
+    )
 
 
 def _resolve(path: Path, saved: TaskSignature, wanted: str | Task | None) -> Task:
@@ -68,15 +94,15 @@ def _resolve(path: Path, saved: TaskSignature, wanted: str | Task | None) -> Tas
         )
     try:
         task = wanted if isinstance(wanted, Task) else get_task(saved.name)
-    except ValueError as error:
-        raise AgentError(f"{path}: {error} Register it first, or pass it as task.") from error
+    except ConfigError as error:
+        raise AgentError(
+            f"{path}: {error} Register it first, which on a command line is "
+            "plugins=[my_task.py], or pass it as task."
+        ) from error
     for field in fields(TaskSignature):
         here, there = (getattr(s, field.name) for s in (TaskSignature.of(task), saved))
         if here != there:
-            raise AgentError(
-                f"{path}: task {saved.name!r} is another one here: expected its {field.name} "
-                f"{here!r}, got {there!r}."
-            )
+            raise another_task(path, task, f"its {field.name} {there!r}", repr(here))
     return task
 
 
@@ -97,41 +123,29 @@ def _additions(task: Task) -> dict[str, Any]:
     return actuator | rates | ({"constraints": limits} if limits else {})
 
 
-def _with_additions(path: Path, task: Task, content: Mapping[str, Any]) -> Task:
+def _with_additions(task: Task, content: Mapping[str, Any]) -> Task:
     """The task with the actuator, the rates and the constraints the agent was trained for."""
     numbers = content.get("actuator")
-    try:
-        actuator = None if numbers is None else from_mapping(Actuator, numbers, "actuator")
-        rates = {name: content.get(name) for name in _RATES}
-        constraints = _constraints(task, content.get("constraints", []))
-        changed = replace(task, actuator=actuator, constraints=constraints, **rates)  # type: ignore[arg-type]
-    except (ConfigError, TypeError, AttributeError) as error:
-        raise AgentError(f"{path}: {error}") from error
-    for name in ("actuator", *_RATES):
-        here, saved = getattr(task, name), getattr(changed, name)
-        if here not in (None, saved):
-            raise AgentError(
-                f"{path}: task {task.name!r} is another one here: expected its {name} {here}, "
-                f"got {saved}."
-            )
-    return task if changed == task else changed
+    actuator = None if numbers is None else from_mapping(Actuator, numbers, "actuator")
+    rates: dict[str, Any] = {name: content.get(name) for name in _RATES}
+    constraints = _constraints(task, content.get("constraints", []))
+    return replace(task, actuator=actuator, constraints=constraints, **rates)
 
 
 def _constraints(task: Task, saved: list[dict[str, Any]]) -> tuple[Constraint, ...]:
-    """The constraints of an agent's file: those of the task, or made anew where it has none."""
-    ours = [constraint.config for constraint in task.constraints]
-    if saved == ours:
-        return task.constraints
-    if ours:
-        raise ConfigError(
-            "constraints",
-            f"task {task.name!r} is another one here: expected its constraints {ours}, "
-            f"got {saved}.",
-        )
-    if functions := [entry["name"] for entry in saved if entry.get("function")]:
-        raise ConfigError(
-            "constraints",
-            f"the agent was trained with {functions}, functions that are no part of its file: "
-            "expected them in the task; pass it as task.",
-        )
-    return tuple(Constraint(**entry) for entry in saved)
+    """The constraints of an agent's file, with the task's functions, which are no part of it."""
+    functions = {each.name: each.function for each in task.constraints if each.function}
+    made = []
+    for entry in saved:
+        values = dict(entry)
+        if values.pop("function", False):
+            name = values.get("name", "")
+            if name not in functions:
+                raise ConfigError(
+                    "constraints",
+                    f"the agent was trained with [{name!r}], a function that is no part of its "
+                    "file: expected it in the task; pass it as task.",
+                )
+            values["function"] = functions[name]
+        made.append(Constraint(**values))
+    return tuple(made)

@@ -8,6 +8,7 @@ import shutil
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from phihp_torchrl.config import get_method, override_lines
 from phihp_torchrl.trainers.run_directory import RunDirectory
@@ -30,7 +31,7 @@ def program() -> list[str]:
 
 
 def next_steps(path: Path) -> list[tuple[str, str]]:
-    """What one does next with a finished run, and the command for it.
+    """What one does next with a finished run, and the command for it, with the run's plugins.
 
     Args:
         path: directory of the run.
@@ -42,7 +43,8 @@ def next_steps(path: Path) -> list[tuple[str, str]]:
     directory = RunDirectory(path)
     if not directory.agent.is_dir():
         return _later_phases(directory)
-    agent = {"agent": str(directory.agent)}
+    config = directory.read_config() if directory.config.is_file() else {}
+    agent = {"agent": str(directory.agent), **_plugins(config)}
     return [
         ("play it in more episodes", _command(["evaluate"], {**agent, "episodes": 200})),
         ("write it as one file for another machine", _command(["export"], agent)),
@@ -63,8 +65,14 @@ def _later_phases(directory: RunDirectory) -> list[tuple[str, str]]:
     if not left or len(left) == len(names):
         return []
     settings = {"task": config["task"], "method": config.get("method", "phihp")}
-    command = _command(["train"], {**settings, "phases": left, "from": str(directory.path)})
+    settings |= {"phases": left, "from": str(directory.path), **_plugins(config)}
+    command = _command(["train"], settings)
     return [("go on to the phases that are left", command)]
+
+
+def _plugins(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The setting that imports what a run has imported; none where that is nothing."""
+    return {"plugins": plugins} if (plugins := config.get("plugins")) else {}
 
 
 def resume_command(path: str | Path) -> str:

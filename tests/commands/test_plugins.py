@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
+
+from phihp_torchrl import Agent, get_task, save_agent
+from phihp_torchrl.agents import Actor
 
 from .command_parts import FAST, PLUGIN, metrics_column
 from .conftest import Command
@@ -55,3 +59,15 @@ def test_one_run_with_all_of_them(
         for name in ("evaluation.json", "agent/evaluation.json")
     )
     assert during["planner"]["returns"] == after["planner"]["returns"]
+
+
+@pytest.mark.usefixtures("registries")
+def test_export_imports_the_task_of_a_plugin(phihp: Command, place: Path) -> None:
+    task = replace(get_task("pendulum"), name="my-pendulum", max_steps=20)
+    save_agent(Agent(task, actor=Actor(task, (4,))), place / "agent")
+    words = ("export", "agent=agent", "format=c", "parts=[actor]", "states=2", "out=exported")
+    with pytest.raises(SystemExit, match=r"got 'my-pendulum'.*plugins=\[my_task\.py\]"):
+        phihp(*words)
+    (place / "my_plugin.py").write_text(PLUGIN)
+    phihp(*words, "plugins=[my_plugin.py]")
+    assert (place / "exported" / "actor.c").is_file()

@@ -12,7 +12,7 @@ import torch
 from lopsided import LOPSIDED
 from tensordict import TensorDict
 
-from phihp_torchrl import get_task, save_agent
+from phihp_torchrl import Agent, Constraint, get_task, save_agent
 from phihp_torchrl.agents import Actor, TwinQ
 from phihp_torchrl.commands import main
 from phihp_torchrl.deployment import (
@@ -26,9 +26,12 @@ from phihp_torchrl.deployment import (
     largest_differences,
     load_exported,
 )
+from phihp_torchrl.deployment.exported import _LOADERS
 from phihp_torchrl.deployment.manifest import Manifest
 from phihp_torchrl.planners import CEMConfig
+from phihp_torchrl.tasks import Actuator
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
+from tests.followed import AIM, followed
 
 from .agent_parts import make_agent as make_small_agent
 from .agent_parts import observations as observe
@@ -192,7 +195,7 @@ def test_the_actor_as_onnx_is_loaded_again_where_it_fits(tmp_path):
     module, path = ActorModule(agent), tmp_path / "actor.onnx"
     act = export_onnx(module, path)
     assert largest_differences(act, module, observations(agent)).max() < 1e-5
-    with pytest.raises(AgentError, match="Register the task first"):
+    with pytest.raises(AgentError, match="Register it first"):
         load_exported(path)
     loaded = load_exported(path, LOPSIDED)
     seen = observations(agent, 1)[0]
@@ -201,11 +204,79 @@ def test_the_actor_as_onnx_is_loaded_again_where_it_fits(tmp_path):
     assert Controller(loaded).step(seen).tolist() == found.tolist()
     with pytest.raises(ValueError, match=r"^observation: expected finite numbers of shape \[3\]"):
         loaded(TensorDict(observation=seen * torch.nan))
-    with pytest.raises(AgentError, match=r"\['time_step'\] differ"):
+    with pytest.raises(AgentError, match=r"expected its time_step"):
         load_exported(path, replace(LOPSIDED, time_step=0.02))
     path.write_bytes(path.read_bytes() + b" ")
     with pytest.raises(AgentError, match="got another"):
         load_exported(path, LOPSIDED)
+
+
+@pytest.fixture
+def exported(tmp_path, monkeypatch):
+    """Write an actor's description beside a file that stands for its model."""
+    monkeypatch.setitem(_LOADERS, ".onnx", lambda path: torch.zeros_like)
+    path = tmp_path / "actor.onnx"
+
+    def write(task):
+        path.write_bytes(b"a model")
+        Manifest.of(ActorModule(Agent(task, actor=Actor(task, (8,)))), path).write(path)
+        return path
+
+    return write
+
+
+def test_an_exported_file_has_what_its_agent_was_trained_with(exported):
+    task = replace(
+        get_task("pendulum"),
+        actuator=Actuator(lag=0.1),
+        action_rate_limit=2.0,
+        action_rate_cost=0.5,
+        constraints=(Constraint("theta_dot", high=4.0, price=1.0),),
+    )
+    path = exported(task)
+    for wanted in (None, "pendulum", task):
+        assert load_exported(path, wanted).task == task
+    for name, other in (("action_rate_limit", 4.0), ("actuator", Actuator(lag=0.2))):
+        with pytest.raises(AgentError, match=f"is another one here: expected its {name}"):
+            load_exported(path, replace(task, **{name: other}))
+    exported(get_task("pendulum"))
+    assert load_exported(path).task is get_task("pendulum")
+
+
+@pytest.mark.parametrize("other", [{"high": (2.0,)}, {"preview": 2}])
+def test_an_exported_file_is_refused_for_another_reference(other, exported):
+    task = followed()
+    path = exported(task)
+    assert load_exported(path, task).task is task
+    with pytest.raises(AgentError, match="another one here: expected the reference"):
+        load_exported(path, followed(reference=replace(AIM, **other)))
+
+
+def test_a_description_of_version_1_says_nothing_of_limits(exported):
+    task = followed(action_rate_limit=2.0, actuator=Actuator(lag=0.1))
+    path = exported(task)
+    place = path.with_name("actor.onnx.json")
+    content = json.loads(place.read_text())
+    added = content.pop("additions")
+    old = {**content, "actuator": added["actuator"]}
+    del old["format_version"]
+    place.write_text(json.dumps(old))
+    assert load_exported(path, task).task == task
+    assert load_exported(path, replace(task, actuator=None)).task == task
+    with pytest.raises(AgentError, match="expected observations of 5 numbers, got 4"):
+        load_exported(path, replace(task, action_rate_limit=None))
+    place.write_text(json.dumps({**content, "additions": added, "format_version": 3}))
+    with pytest.raises(AgentError, match="expected format_version 1 or 2, got 3"):
+        load_exported(path, task)
+
+
+@pytest.mark.parametrize("task", [{}, {"name": 3}, 3, "x"])
+def test_a_description_without_a_task_is_refused(task, exported):
+    path = exported(get_task("pendulum"))
+    place = path.with_name("actor.onnx.json")
+    place.write_text(json.dumps({**json.loads(place.read_text()), "task": task}))
+    with pytest.raises(AgentError):
+        load_exported(path)
 
 
 @pytest.mark.slow

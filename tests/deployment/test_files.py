@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from dataclasses import replace
 
@@ -22,7 +23,7 @@ from phihp_torchrl.deployment import AgentError
 from phihp_torchrl.dynamics import PhysicsPrior, ResidualMLP
 from phihp_torchrl.integrators import Dopri5, SemiImplicitEuler, make_integrator
 from phihp_torchrl.planners import CEMConfig, MPPIConfig
-from phihp_torchrl.tasks import list_tasks, registry
+from phihp_torchrl.tasks import Actuator, Constraint, list_tasks, registry
 from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 from .agent_parts import act, make_agent, observations
@@ -169,7 +170,7 @@ def test_lopsided_bounds_are_kept(tmp_path):
     for name in ("actor", "qvalue"):
         assert loaded.modules_by_name()[name].bounds.low.item() == -6.0
     other = replace(LOPSIDED, action_low=(-5.0,))
-    with pytest.raises(AgentError, match=r"expected its action_low \(-5\.0,\), got \(-6\.0,\)"):
+    with pytest.raises(AgentError, match=r"expected its action_low \(-6\.0,\), got \(-5\.0,\)"):
         load_agent(tmp_path, task=other)
 
 
@@ -199,12 +200,65 @@ def test_own_tasks(tmp_path, monkeypatch):
     save_agent(Agent(task, actor=Actor(task, (4,))), tmp_path)
     with pytest.raises(AgentError, match=r"expected one of .*'acrobot'.* got 'agent-io-pendulum'"):
         load_agent(tmp_path)
+    with pytest.raises(AgentError, match=r"plugins=\[my_task\.py\], or pass it as task"):
+        load_agent(tmp_path)
     assert load_agent(tmp_path, task=task).task is task
     assert load_agent(tmp_path, task=replace(task, max_steps=7)).task.max_steps == 7
-    with pytest.raises(AgentError, match=r"another one here: expected its time_step 0.1, got 0.05"):
+    with pytest.raises(AgentError, match=r"another one here: expected its time_step 0.05, got 0.1"):
         load_agent(tmp_path, task=replace(task, time_step=0.1))
     register_task(task)
     assert load_agent(tmp_path).task is task
+
+
+OWN = replace(
+    get_task("pendulum"),
+    name="agent-io-limited",
+    actuator=Actuator(lag=0.1),
+    action_rate_limit=4.0,
+    action_rate_cost=0.5,
+    constraints=(
+        Constraint("theta_dot", high=4.0, price=1.0),
+        Constraint(
+            "power", high=5.0, price=1.0, function=lambda s, action: s[..., 1] * action[..., 0]
+        ),
+    ),
+)
+"""A task with all the numbers that the settings of a run may change."""
+
+CHANGES = {
+    "actuator": Actuator(lag=0.2),
+    "action_rate_limit": 2.0,
+    "action_rate_cost": 0.25,
+    "constraints": (replace(OWN.constraints[0], price=3.0), replace(OWN.constraints[1], high=6.0)),
+}
+
+
+@pytest.fixture
+def own_task(monkeypatch):
+    """The task is registered, for one test."""
+    monkeypatch.setattr(registry._TASKS, "_entries", dict(registry._TASKS))
+    monkeypatch.setattr(choices, "_OFFERED", dict(choices._OFFERED))
+    return register_task(OWN)
+
+
+@pytest.mark.parametrize("wanted", [None, OWN.name])
+@pytest.mark.parametrize("changes", [*({k: v} for k, v in CHANGES.items()), {"constraints": ()}])
+def test_a_task_that_is_found_by_name_has_the_numbers_of_the_training(
+    changes, wanted, own_task, tmp_path
+):
+    trained = replace(own_task, **changes)
+    save_agent(Agent(trained, actor=Actor(trained, (4,))), tmp_path)
+    assert load_agent(tmp_path, task=wanted).task == trained
+    assert load_agent(tmp_path, task=trained).task is trained
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_task_that_is_given_is_refused_with_other_numbers(name, own_task, tmp_path):
+    trained = replace(own_task, **{name: CHANGES[name]})
+    save_agent(Agent(trained, actor=Actor(trained, (4,))), tmp_path)
+    there, here = (re.escape(str(getattr(each, name))) for each in (trained, own_task))
+    with pytest.raises(AgentError, match=f"expected its {name} {there}, got {here}"):
+        load_agent(tmp_path, task=own_task)
 
 
 def test_compiled_plans_are_the_same(tmp_path, monkeypatch):
