@@ -121,7 +121,7 @@ class ControlProblem(nn.Module):
         registers = self.task.split(state)[1]
         command = self.task.command(registers, action)
         earned = self.task.earned(state, command, next_state)
-        price = self.task.price(state, action)
+        price = self.task.price(state, action, next_state)
         return ((0.0 if price is None else price) - earned) / self.spread
 
     def pay_last(self, state: Tensor) -> Tensor:

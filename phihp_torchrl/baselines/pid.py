@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +12,7 @@ from phihp_torchrl.baselines.controller import Controller
 from phihp_torchrl.baselines.point import LinearModel, half_ranges, is_smooth, linearise
 from phihp_torchrl.baselines.reference import followed, middle, present
 from phihp_torchrl.baselines.tuning import Gains, pair, tune
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, check_positive
 from phihp_torchrl.tasks import Task
 
 
@@ -93,9 +94,12 @@ class PID(Controller):
             time_constant: λ of all loops, in seconds; by default the shortest robust one.
 
         Raises:
-            ConfigError: for an unknown name, where the task has no goal, and where no gains give a
-                stable loop; the message names the component.
+            ConfigError: for an unknown name, a time constant that is no positive number, where the
+                task has no goal, and where no gains give a stable loop; the message names the
+                component.
         """
+        if time_constant is not None:
+            check_positive(SimpleNamespace(time_constant=time_constant), "time_constant")
         follows = list(followed(task))
         if follows and goal is None:
             goal = middle(task)

@@ -76,13 +76,19 @@ def discount_of(text: str, time_step: float) -> float:
     """The discount per step, γ = exp(-time_step / τ), of the time constant τ that a text names.
 
     Raises:
-        ConfigError: for a text that is no duration.
+        ConfigError: for a text that is no duration, and for less than a step.
 
     Examples:
         >>> round(discount_of("8 s", time_step=0.04), 4)
         0.995
     """
-    return math.exp(-time_step / parse_seconds(text))
+    seconds = parse_seconds(text)
+    if seconds < time_step:
+        raise ConfigError(
+            "seconds",
+            f"expected a time constant of at least a step of {time_step:g} s, got {text!r}.",
+        )
+    return math.exp(-time_step / seconds)
 
 
 def check_steps(config: object, *names: str) -> None:
@@ -161,8 +167,9 @@ def resolve_seconds(config: T, time_step: float) -> T:
         time_step: seconds in a step of the task.
 
     Raises:
-        ConfigError: for a duration of less than half a step, and for numbers that do not fit each
-            other once they are known; the message has the dotted name.
+        ConfigError: for a duration of less than half a step, a time constant of less than a step,
+            and numbers that do not fit each other once they are known; the message has the dotted
+            name.
 
     Examples:
         >>> from phihp_torchrl.planners import CEMConfig

@@ -14,6 +14,9 @@ from phihp_torchrl.systems import System, wrap
 from phihp_torchrl.tasks.box import Box
 from phihp_torchrl.tasks.constraint import Constraint
 
+_STARTS = 256
+"""Starts of episodes by which a hard constraint of an angle or of a function is judged."""
+
 _NUMBERS = ["low", "high", "price", "hard"]
 """What settings may say of a constraint."""
 
@@ -28,8 +31,9 @@ class Constraints:
 
     Raises:
         ConfigError: naming the constraint: for the name of no state, a name that is there twice, a
-            function that gives no value for each state, and a hard one outside which episodes
-            start.
+            function that fails or gives no value for each state, a hard one of a state outside
+            which episodes start, and one of an angle, or of a function without ``action``, outside
+            which all of them do.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -150,14 +154,8 @@ class Constraints:
         if self.names.count(name) > 1:
             raise ConfigError(f"constraints.{name}", "expected a name of its own, got it twice.")
         if constraint.function is not None:
-            states, actions = torch.zeros(2, system.state_dim), torch.zeros(2, system.action_dim)
-            value = self._violation(constraint, states, actions)
-            if value.shape != (2,):
-                raise ConfigError(
-                    f"constraints.{name}.function",
-                    f"expected [*batch] for states [*batch, {system.state_dim}], so [2] for 2, "
-                    f"got {list(value.shape)}.",
-                )
+            self._check_function(constraint)
+            self._check_starts(constraint)
             return
         if name not in system.state_names:
             raise ConfigError(
@@ -171,6 +169,7 @@ class Constraints:
                     f"constraints.{name}",
                     f"expected limits of an angle in [-pi, pi], got {limits}.",
                 )
+            self._check_starts(constraint)
             return
         index = system.state_names.index(name)
         ends = torch.tensor([self._reset.low[index], self._reset.high[index]], dtype=torch.float64)
@@ -179,4 +178,32 @@ class Constraints:
                 f"constraints.{name}",
                 "expected limits around the task's reset box, "
                 f"{ends[0].item():g} to {ends[1].item():g}, since episodes start there.",
+            )
+
+    def _check_function(self, constraint: Constraint) -> None:
+        key, system = f"constraints.{constraint.name}.function", self._system
+        states, actions = torch.zeros(2, system.state_dim), torch.zeros(2, system.action_dim)
+        expected = (
+            "expected function(state) or function(state, action) that gives [*batch] for states "
+            f"[*batch, {system.state_dim}] and actions [*batch, {system.action_dim}]"
+        )
+        try:
+            shape = list(self._violation(constraint, states, actions).shape)
+        # A user's function may raise anything; the message should name it and the reason.
+        except Exception as error:
+            reason = f"{expected}; it failed with {type(error).__name__}: {error}"
+            raise ConfigError(key, reason) from error
+        if shape != [2]:
+            raise ConfigError(key, f"{expected}, so [2] for 2, got {shape}.")
+
+    def _check_starts(self, constraint: Constraint) -> None:
+        """Refuse a hard one that every start violates; what reads the action has none there."""
+        if not constraint.hard or constraint.reads_action:
+            return
+        starts = self._reset.sample([_STARTS], generator=torch.Generator().manual_seed(0))
+        if (self._violation(constraint, starts, None) > 0).all():
+            raise ConfigError(
+                f"constraints.{constraint.name}",
+                f"expected limits that some starts of episodes keep, got low={constraint.low}, "
+                f"high={constraint.high}, which all {_STARTS} drawn from the reset box violate.",
             )

@@ -7,15 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from phihp_torchrl.config import ConfigError, to_mapping
+from phihp_torchrl.config import ConfigError, differences, load_config, to_mapping
 from phihp_torchrl.display import duration
 from phihp_torchrl.trainers.evaluate import EvaluateConfig
 from phihp_torchrl.trainers.run_config import RunConfig
 from phihp_torchrl.trainers.run_directory import RunDirectory
+from phihp_torchrl.trainers.run_request import read_run_config
 
 _RATES = Path(__file__).with_name("rates.json")  # benchmarks/speed/rates.py writes it
 _EARLIER = 5
 """Runs beside this one that are looked at, from the newest."""
+
+_NAMED = 3
+"""Settings unlike those of the committed runs that are named."""
 
 _LATER = "The time left is measured as the run goes on."
 
@@ -58,7 +62,8 @@ def expect(config: RunConfig, path: Path) -> Expected:
 
     A finished run beside it whose phases had the same settings tells it best, since it was on this
     machine. Otherwise committed runs of the same method, preset and task do, in proportion to the
-    amount of work. Nothing is expected of phases that neither has.
+    amount of work. They had the default settings: those that differ, and on which the time depends
+    in a way that is not known, are named. Nothing is expected of phases that neither has.
 
     Args:
         config: settings of the run.
@@ -89,7 +94,23 @@ def expect(config: RunConfig, path: Path) -> Expected:
         f"committed runs of it (version {' and '.join(about['versions'])}, on "
         f"{' or '.join(about['machines'])}, shared with other work)"
     )
+    if of:
+        source += _unlike(config, {f"{name}.{key}" for name, key in rates["per"].items()})
     return Expected(ends[0], ends[1], ends[2], source)
+
+
+def _unlike(config: RunConfig, amounts: set[str]) -> str:
+    """What is unlike the committed runs, in words; the amounts of work are reckoned with."""
+    usual = load_config(config.task, method=config.method, preset=config.preset)
+    found = [
+        f"{key}={value}"
+        for key, value, _ in differences(_work(config), _work(read_run_config(usual)))
+        if key not in {*amounts, "evaluate.episodes"}
+    ]
+    if not found:
+        return ""
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    return f" with default settings, unlike them here: {', '.join(found[:_NAMED])}{more}"
 
 
 def _earlier(config: RunConfig, path: Path) -> dict[str, float] | None:
@@ -111,7 +132,13 @@ def _earlier(config: RunConfig, path: Path) -> dict[str, float] | None:
 
 
 def _work(config: RunConfig) -> dict[str, Any]:
-    """The settings on which the duration depends: of the phases to do, and of the planner."""
+    """The settings on which the duration depends: of phases to do, planner, world and process."""
     sections = {name: to_mapping(config.section(name)) for name in config.phases_to_do}
     ours = config.to_mapping()
-    return {**sections, **{key: ours.get(key) for key in ("task", "method", "planner", "compile")}}
+    return {
+        **sections,
+        **{
+            key: ours.get(key)
+            for key in ("task", "method", "planner", "world", "compile", "threads")
+        },
+    }

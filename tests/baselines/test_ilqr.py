@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from phihp_torchrl import ConfigError, HybridDynamics, get_task
 from phihp_torchrl.baselines import ILQR, LQR, ILQRConfig, make_baselines
-from phihp_torchrl.tasks import Actuator, Signal, Task
+from phihp_torchrl.tasks import Actuator, Constraint, Signal, Task
 
 from .parts import Slider, play, prior_of, task_of
 
@@ -126,6 +126,20 @@ def test_it_reckons_with_what_is_under_way_and_with_a_reference() -> None:
     state = to.with_signals(to.at_rest(torch.zeros(2, 2)), torch.tensor([[0.5], [-0.5]]))
     action = acting(ilqr, state)
     assert action[0] > 0 > action[1]
+
+
+def test_constraints_cost_their_price_and_turn_it_away() -> None:
+    power = Constraint("power", high=0.5, price=2.0, function=lambda s, action: action[..., 0])
+    slow = Constraint("x_dot", low=-0.1, price=20.0)
+    free, held = push(), push(constraints=(slow, power))
+    config = ILQRConfig(horizon=15, rounds=1, first_rounds=6, guesses=4)
+    plans = [ILQR.from_model(task, prior_of(task), config) for task in (free, held)]
+    state, unit, after = (torch.tensor([row]) for row in ([0.5, 0.0], [0.4], [0.5, -0.5]))
+    spread = plans[0].problem.spread
+    paid = plans[1].problem.pay(state, unit, after) - plans[0].problem.pay(state, unit, after)
+    torch.testing.assert_close(paid, torch.tensor([(20.0 * 0.4 + 2.0 * 1.5) / spread]))
+    fastest = [play(plan, plan.task, state, 20)[..., 1].min() for plan in plans]
+    assert fastest[1] > -0.13 > fastest[0]
 
 
 def test_what_it_cannot_do_is_named() -> None:

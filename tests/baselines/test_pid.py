@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -97,6 +98,13 @@ def test_what_is_wrong_is_named() -> None:
     late = task_of(Slider(), Actuator(delay_steps=9.0))
     with pytest.raises(ConfigError, match="component: expected a loop that force can stabilise"):
         PID.from_model(late, prior_of(late), time_constant=0.2)
+
+
+@pytest.mark.parametrize("seconds", [float("nan"), float("inf"), 0.0, -1.0, "1 s", True])
+def test_a_time_constant_that_is_none_is_refused(seconds: Any) -> None:
+    task = task_of(Slider())
+    with pytest.raises(ConfigError, match="time_constant: expected a positive number, got"):
+        PID.from_model(task, prior_of(task), time_constant=seconds)
 
 
 # References.

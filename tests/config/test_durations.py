@@ -71,6 +71,15 @@ def test_less_than_half_a_step_is_refused() -> None:
         steps_in("0.02 s", 0.05)
 
 
+def test_a_time_constant_of_less_than_a_step_is_refused() -> None:
+    assert discount_of("0.04 s", 0.04) == pytest.approx(math.exp(-1.0))
+    with pytest.raises(ConfigError, match=r"at least a step of 0.04 s, got '1 ms'"):
+        discount_of("1 ms", 0.04)
+    with pytest.raises(ConfigError) as error:
+        resolve_seconds(PolicyConfig(td3=TD3Config(gamma="30 ms")), 0.04)
+    assert error.value.key == "td3.gamma"
+
+
 def test_a_discount_by_its_time_constant_means_the_same_at_every_time_step() -> None:
     for step in (0.01, 0.02, 0.05):
         assert discount_of("3 s", step) ** round(3 / step) == pytest.approx(math.exp(-1))

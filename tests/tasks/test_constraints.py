@@ -174,6 +174,16 @@ def test_a_constrained_step_compiles_as_one_graph():
             "constraints.x",
         ),
         (
+            lambda: limited(Constraint("theta", low=-1.0, high=1.0, hard=True)),
+            "constraints.theta",
+        ),
+        (
+            lambda: limited(
+                Constraint("up", low=0.0, hard=True, function=lambda s: s[..., 2].cos())
+            ),
+            "constraints.up",
+        ),
+        (
             lambda: limited(NEAR).price(torch.zeros(2, 4), torch.zeros(2, 1)),
             "next_state",
         ),
@@ -183,3 +193,30 @@ def test_what_is_wrong_is_refused_by_name(make, key):
     with pytest.raises(ConfigError) as error:
         make()
     assert error.value.key == key
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda state, command: command[..., 0],
+        lambda state, action, next_state: next_state[..., 0],
+        lambda: 0.0,
+        lambda state: 0.0,
+        lambda state: state[..., 99],
+    ],
+)
+def test_a_function_that_cannot_be_called_is_refused_with_what_it_is_called_with(function):
+    with pytest.raises(
+        ConfigError, match=r"function\(state\) or function\(state, action\)"
+    ) as error:
+        limited(replace(POWER, function=function))
+    assert error.value.key == "constraints.power.function"
+
+
+def test_some_starts_within_a_hard_constraint_are_enough():
+    right = Constraint("right", low=0.0, hard=True, function=lambda state: state[..., 0])
+    half = Constraint("theta", low=0.0, hard=True)
+    spread = Box.around((0.0,) * 4, (0.1,) * 4)
+    assert limited(right, half, reset=spread).limits.ends_episodes
+    # What an action does is not known before there is one.
+    assert limited(replace(POWER, price=None, hard=True, low=1.0)).limits.ends_episodes

@@ -13,12 +13,14 @@ from pages import foreign, read
 from tensordict import TensorDict
 
 from phihp_torchrl.commands import tell
+from phihp_torchrl.config import load_config
 from phihp_torchrl.tasks import get_task
 from phihp_torchrl.trainers import RunResult, next_steps
 from phihp_torchrl.trainers.expected import expect
 from phihp_torchrl.trainers.real_data import collected_return
 from phihp_torchrl.trainers.report import report_run, true_constants, write_report
 from phihp_torchrl.trainers.run_directory import RunDirectory
+from phihp_torchrl.trainers.run_request import read_run_config
 from phihp_torchrl.worlds import make_world
 
 from .run_parts import CONFIG
@@ -120,6 +122,17 @@ def test_a_run_of_the_first_phase_says_how_to_go_on(copied: Path) -> None:
     assert f"from={copied}" in command
 
 
+def test_commands_name_the_plugins_of_the_run(copied: Path) -> None:
+    directory = RunDirectory(copied)
+    directory.write_config({**directory.read_config(), "plugins": ["my_task.py", "rig"]})
+    for _, command in next_steps(copied):
+        assert "plugins=[my_task.py,rig]" in command
+    for name in ("agent", "phases/policy", "phases/evaluate"):
+        shutil.rmtree(copied / name)
+    ((_, command),) = next_steps(copied)
+    assert "plugins=[my_task.py,rig]" in command
+
+
 def test_commands_are_quoted(copied: Path) -> None:
     moved = copied.rename(copied.with_name("my run; rm -rf"))
     assert all("'" in command for _, command in next_steps(moved))
@@ -160,6 +173,24 @@ def test_only_more_episodes_than_usual_take_longer(tmp_path: Path) -> None:
     few, usual, many = found
     assert usual is not None
     assert (few, many) == (usual, pytest.approx(4 * usual))
+
+
+def test_settings_unlike_those_that_were_measured_are_named(tmp_path: Path) -> None:
+    def words(*changes: str, method: str = "phihp") -> str:
+        settings = load_config("pendulum", method=method, overrides=[*changes])
+        return expect(read_run_config(settings), tmp_path / "x").words()
+
+    amounts = ("policy.updates=80000", "model.real_steps=5000", "evaluate.episodes=200", "seed=3")
+    for same in (words(), words(*amounts), words(method="td3")):
+        assert "by committed runs of it" in same
+        assert "unlike" not in same
+    two = words("policy.method=analytic", "model.ensemble=5")
+    assert "unlike them here: model.ensemble=5, policy.method=analytic. The time left" in two
+    many = words(
+        "planner.num_candidates=9", "planner.top_k=3", "policy.batch_size=8", "threads=2",
+        "world.friction.damping=0.3",
+    )  # fmt: skip
+    assert "and 2 more" in many
 
 
 def collected(done: list[bool], terminated: list[bool]) -> TensorDict:
