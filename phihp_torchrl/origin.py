@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 _PACKAGES = ("phihp_torchrl", "torch", "torchrl", "tensordict", "gymnasium", "numpy")
+_CPUINFO = Path("/proc/cpuinfo")
 _GIT_SECONDS = 60
 """On a busy machine, or one whose files are far away, git needs its time."""
 
@@ -35,7 +36,7 @@ def describe_origin(seed: int) -> dict[str, Any]:
     Examples:
         >>> origin = describe_origin(seed=3)
         >>> origin["seed"], sorted(origin["machine"])
-        (3, ['cpus', 'gpus', 'memory_gib', 'system'])
+        (3, ['cpus', 'gpus', 'memory_gib', 'processor', 'system'])
     """
     versions = {"python": platform.python_version()}
     versions |= {package: package_version(package) for package in _PACKAGES}
@@ -47,6 +48,7 @@ def describe_origin(seed: int) -> dict[str, Any]:
         "dirty": has_changes(),
         "machine": {
             "system": f"{platform.system()} {platform.machine()}",
+            "processor": processor_name(),
             "cpus": os.cpu_count(),
             "memory_gib": _memory_gib(),
             "gpus": torch.cuda.device_count(),
@@ -131,16 +133,35 @@ def commit_text(origin: Mapping[str, Any]) -> str:
 
 
 def machine_text(origin: Mapping[str, Any]) -> str:
-    """Return the size of the machine as text.
+    """Return the size of the machine as text, and its processor where that was recorded.
 
     Examples:
-        >>> machine_text({"machine": {"cpus": 2, "memory_gib": 23.5, "gpus": 0}})
+        >>> machine = {"cpus": 2, "memory_gib": 23.5, "gpus": 0}
+        >>> machine_text({"machine": machine})
         '2 cores, 24 GiB, 0 GPUs'
+        >>> machine_text({"machine": {**machine, "processor": "AMD EPYC"}})
+        '2 cores (AMD EPYC), 24 GiB, 0 GPUs'
     """
     machine = origin["machine"]
     memory = machine["memory_gib"]  # None on systems that do not report it
     size = "memory unknown" if memory is None else f"{memory:.0f} GiB"
-    return f"{machine['cpus']} cores, {size}, {machine['gpus']} GPUs"
+    name = machine.get("processor")  # runs of earlier versions do not say it
+    kind = f" ({name})" if name else ""
+    return f"{machine['cpus']} cores{kind}, {size}, {machine['gpus']} GPUs"
+
+
+@cache
+def processor_name() -> str:
+    """Return the name of the processor, or ``""`` where the system does not say it.
+
+    Python itself knows none on most Linux systems.
+    """
+    try:
+        lines = _CPUINFO.read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor())
 
 
 def _memory_gib() -> float | None:

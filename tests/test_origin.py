@@ -42,3 +42,27 @@ def test_results_that_are_being_written_are_no_change_of_the_code(
     moved = origin.describe_origin(seed=0)
     assert (moved["commit"], moved["dirty"]) == (found["commit"], False)
     assert origin.ask_git(tmp_path, "rev-parse", "HEAD") != found["commit"]
+
+
+def test_a_machine_is_told_by_its_processor() -> None:
+    machine = origin.describe_origin(seed=0)["machine"]
+    assert machine["processor"] == origin.processor_name()
+    text = origin.machine_text({"machine": {**machine, "processor": "AMD EPYC"}})
+    assert text.startswith(f"{machine['cpus']} cores (AMD EPYC), ")
+
+
+def test_the_name_of_the_processor_is_what_linux_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "cpuinfo"
+    file.write_text("processor\t: 0\nmodel name\t: AMD EPYC: 7B12\nmodel name\t: other\n")
+    monkeypatch.setattr(origin, "_CPUINFO", file)
+    origin.processor_name.cache_clear()
+    try:
+        assert origin.processor_name() == "AMD EPYC: 7B12"
+        file.unlink()
+        origin.processor_name.cache_clear()
+        monkeypatch.setattr(origin.platform, "processor", lambda: "of another system")
+        assert origin.processor_name() == "of another system"
+    finally:
+        origin.processor_name.cache_clear()

@@ -59,12 +59,11 @@ def page(entry: dict[str, Any]) -> str:
         rows.append([row["acting"], *counts, reasons, *times, f"{row['load']:.1f}"])
     header = ["agent", "Hz", "ticks", "missed", "taken over", "p50 ms", "p99 ms", "load"]
     before = ", ".join(f"{each:.1f}" for each in entry["load_before"])
-    machine = entry["processor"]
     return (
         "# Control loops through a socket\n\n"
         "Made by `python benchmarks/paper/control_loops.py`; do not edit. The agent is "
         f"`{entry['agent']}`, one thread, torch {entry['origin']['versions']['torch']}.\n\n"
-        f"Made at {origin_text(entry['origin'])}, {machine}. Load averages before (1, 5 and 15 "
+        f"Made at {origin_text(entry['origin'])}. Load averages before (1, 5 and 15 "
         f"minutes): {before}; each row has that of the last minute at its end. Above the number of "
         "cores, other work took part of the time, and these figures are upper bounds.\n\n"
         f"{markdown_table(header, rows)}\n\n"
@@ -90,7 +89,6 @@ def main() -> None:
         "agent": str(words.agent),
         "seconds": words.seconds,
         "origin": describe_origin(seed=0),
-        "processor": _processor(),
         "load_before": os.getloadavg(),
         "rows": [],
     }
@@ -100,14 +98,6 @@ def main() -> None:
         text = json.dumps(entry, indent=1)
         (words.out / "realtime.json").write_text(text + "\n")
         (words.out / "README.md").write_text(page(entry))
-
-
-def _processor() -> str:
-    """The processor's name, where the system says it."""
-    file = Path("/proc/cpuinfo")
-    lines = file.read_text().splitlines() if file.is_file() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else "processor unknown"
 
 
 if __name__ == "__main__":

@@ -5,7 +5,9 @@
 
 Trains and evaluates one cell of the grid as ``run_grid.py`` does, in a temporary folder, and
 compares its mean returns with those in results/runs. The same code, settings and kind of machine
-give the same number; another commit or settings are named.
+give the same number; another commit or settings are named. A method has the settings that the grid
+gives it; those that a grid was asked for besides are given with ``--overrides``. A cell of the last
+proof plays the episodes of the proof again, by the code of a commit.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
 
 RUNS = Path("results/runs")
+GRID = Path(__file__).parent / "config" / "grid.yaml"
 _WAYS = ("planner", "actor")
 
 
@@ -44,6 +48,18 @@ def beside(committed: CellFiles, made: CellFiles) -> str:
     session = json.loads((committed.kept / "metadata.json").read_text())["sessions"][0]
     now = describe_origin(committed.cell.seed)
     return text + f"\nCommitted: {origin_text(session)}. Made again: {origin_text(now)}.\n"
+
+
+def _is_proof(committed: CellFiles) -> bool:
+    """Whether the cell is of the last proof; those of earlier versions do not say it."""
+    cell = committed.kept / "cell.json"
+    return cell.is_file() and bool(json.loads(cell.read_text()).get("proof", False))
+
+
+def _method_overrides() -> dict[str, tuple[str, ...]]:
+    """The settings that the grid gives methods besides their own."""
+    given = yaml.safe_load(GRID.read_text())["method_overrides"]
+    return {method: tuple(settings) for method, settings in given.items()}
 
 
 def _settings(files: CellFiles) -> dict[str, Any]:
@@ -79,6 +95,7 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=0.5, help="of the published real samples")
     parser.add_argument("--label", default="default")
     parser.add_argument("--runs", type=Path, default=RUNS, help="folder of the committed runs")
+    parser.add_argument("--overrides", nargs="*", default=[], help="as the grid was given them")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         try:
@@ -88,10 +105,11 @@ def main() -> None:
                 options.seed,
                 options.share,
                 options.label,
-                overrides=("evaluate.video=false",),
+                overrides=("evaluate.video=false", *options.overrides),
                 allow_dirty=True,  # it is compared, not kept
                 runs=f"{place}/runs",
                 results=f"{place}/results",
+                method_overrides=_method_overrides(),
             )
         except ConfigError as error:
             parser.error(str(error))
@@ -99,7 +117,12 @@ def main() -> None:
         committed = CellFiles(made.cell, made.runs, options.runs)
         if not committed.evaluation.is_file():
             parser.error(f"{committed.kept}: expected a committed run, there is none.")
-        state = work(config, Path())
+        if _is_proof(committed):
+            config = replace(config, proof=True, allow_dirty=False)
+        try:
+            state = work(config, Path())
+        except ConfigError as error:
+            parser.exit(1, f"{made.cell.name}: {error}\n")
         if state.status is not Status.DONE:
             parser.exit(1, f"{made.cell.name}: {state.status.value}: {state.detail}\n")
         print(beside(committed, made))

@@ -9,10 +9,8 @@ that has it is compiled. The compiler's cache keeps what was chosen.
 from __future__ import annotations
 
 import functools
-import platform
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -20,6 +18,8 @@ from torch import Tensor, fx
 from torch._inductor.custom_graph_pass import CustomGraphPass, get_hash_for_files
 from torch._inductor.virtualized import V
 from torch._subclasses.fake_tensor import unset_fake_temporarily
+
+from phihp_torchrl.origin import processor_name
 
 _aten = torch.ops.aten
 # Products of fewer multiplications stay with the BLAS, because calling oneDNN costs more than its
@@ -145,17 +145,8 @@ class FasterProducts(CustomGraphPass):
 
     def uuid(self) -> bytes:
         # What was measured holds for such a machine, and so does a graph in the compiler's cache.
-        machine = _processor(), torch.backends.cpu.get_cpu_capability()
+        machine = processor_name(), torch.backends.cpu.get_cpu_capability()
         return get_hash_for_files((__file__,), f"{machine} {torch.get_num_threads()}")
-
-
-def _processor() -> str:
-    """The name of the processor, of which Python knows nothing on most Linux systems."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    return next((line for line in lines if line.startswith("model name")), platform.processor())
 
 
 def _is_eligible(node: Any) -> bool:

@@ -110,5 +110,5 @@ class CellFiles:
 
     @property
     def planned(self) -> Path:
-        """The names of all cells that grids with these results were asked for."""
+        """All cells that grids with these results were asked for, by their names."""
         return self.results / "planned.json"

@@ -26,6 +26,8 @@ from phihp_torchrl.evaluation import (
 from phihp_torchrl.trainers import import_plugins
 
 _FIRST_SEED = "evaluate.first_seed"
+# A plan that is packaged where a core is idle would be timed by it in some cells and not in others.
+_PROOF = ("evaluate.packaged=false",)
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class GridConfig:
         lines = [f"task={cell.task}", f"method={cell.method}", f"seed={cell.seed}"]
         lines += ["progress=false", *override_lines({"plugins": self.plugins})]
         if self.proof:
-            lines.append(f"{_FIRST_SEED}={self.first_seed}")
+            lines += [f"{_FIRST_SEED}={self.first_seed}", *_PROOF]
         if cell.samples is not None:
             lines.append(f"{samples_key}={cell.samples}")
         return [*lines, *self.method_overrides.get(self.method, ()), *self.overrides]

@@ -67,20 +67,21 @@ def keep_failure(files: CellFiles, record: Mapping[str, Any]) -> None:
 
 
 def keep_names(cells: Sequence[CellFiles]) -> None:
-    """Add the cells that a grid was asked for to the names in ``planned.json``.
+    """Add the cells that a grid was asked for to ``planned.json``, by their names.
 
     With it a report can say how many of the planned cells there are, and which are missing.
     """
-    named = defaultdict[tuple[Path, Path], set[str]](set)
+    named = defaultdict[tuple[Path, Path], dict[str, Any]](dict)
     for files in cells:
-        named[files.planned, files.runs].add(files.cell.name)
-    for (planned, runs), names in named.items():
+        named[files.planned, files.runs][files.cell.name] = asdict(files.cell)
+    for (planned, runs), asked in named.items():
         with claim(runs / f"{planned.name}.lock", wait=60.0):
-            before = json.loads(planned.read_text()) if planned.is_file() else []
-            if names <= set(before):
+            before = json.loads(planned.read_text()) if planned.is_file() else {}
+            if asked.keys() <= before.keys():
                 continue
             planned.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(planned, json.dumps(sorted(names.union(before)), indent=2) + "\n")
+            every = dict(sorted({**before, **asked}.items()))
+            write_atomically(planned, json.dumps(every, indent=2) + "\n")
 
 
 def fingerprint(folder: Path) -> str:

@@ -90,14 +90,16 @@ def _check_proof(config: GridConfig, files: CellFiles) -> None:
             check_sessions(files.run)
 
 
-def _check_episodes(config: GridConfig, settings: Mapping[str, Any]) -> None:
-    """Refuse a run whose evaluation would play others' episodes, however it was told to."""
+def _check_evaluation(config: GridConfig, settings: Mapping[str, Any]) -> None:
+    """Refuse a run that would play others' episodes, and a proof that hangs on an idle core."""
     found = settings["evaluate"]["first_seed"]
     if found != config.first_seed:
         raise ConfigError(
             "evaluate.first_seed",
             f"expected {config.first_seed} with proof={str(config.proof).lower()}, got {found}.",
         )
+    if config.proof and settings["evaluate"]["packaged"] == "auto":
+        raise ConfigError("evaluate.packaged", "expected true or false with proof=true, got auto.")
 
 
 def _run(config: GridConfig, files: CellFiles) -> None:
@@ -106,7 +108,7 @@ def _run(config: GridConfig, files: CellFiles) -> None:
     torch.compiler.reset()
     try:
         request = _request(config, files)
-        _check_episodes(config, request.config.to_mapping())
+        _check_evaluation(config, request.config.to_mapping())
         _log.info("%s", "resumed" if request.resume else "started")
         result = run(request.config, request.path, resume=request.resume)
         if result.finished:

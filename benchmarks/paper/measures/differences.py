@@ -23,7 +23,8 @@ class Difference:
         high: upper end.
         p: two-sided p-value; NaN with fewer than :data:`FEWEST_SEEDS` values on either side.
         seeds: number of values on either side.
-        mixed: whether values of one side are of several configurations; there is no p-value then.
+        mixed: whether values of one side are of several configurations, or the two sides of other
+            episodes; there is no p-value then.
     """
 
     mean: float
@@ -103,8 +104,13 @@ def paired_difference_of_seeds(values: Sequence[float], level: float = 0.95) -> 
     return Difference(mean, float(low), float(high), p, seeds)
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
+def holm(p_values: Sequence[float], family: int = 0) -> list[float]:
     """Holm's adjustment of a family of p-values; NaN stays NaN and is not counted.
+
+    Args:
+        p_values: those that there are.
+        family: the number of tests that were planned, where it is larger: one that could not be
+            done counts as the least significant.
 
     A family in which all differences are nil has some adjusted value below 0.05 in at most 5 % of
     cases (Holm, 1979, Scandinavian Journal of Statistics 6).
@@ -112,12 +118,15 @@ def holm(p_values: Sequence[float]) -> list[float]:
     Examples:
         >>> holm([0.01, 0.04, 0.03])
         [0.03, 0.06, 0.06]
+        >>> holm([0.01], family=4)
+        [0.04]
     """
     order = sorted(
         (i for i, p in enumerate(p_values) if not math.isnan(p)), key=p_values.__getitem__
     )
+    size = max(family, len(order))
     adjusted, largest = list(p_values), 0.0
     for rank, i in enumerate(order):
-        largest = max(largest, min(1.0, (len(order) - rank) * p_values[i]))
+        largest = max(largest, min(1.0, (size - rank) * p_values[i]))
         adjusted[i] = largest
     return adjusted

@@ -16,6 +16,7 @@ from report.generalization import generalization
 from report.main_table import main_table
 from report.over_runs import aggregate_section
 from report.overview import fill_page, origins, overview
+from report.planned import planned_section, read_planned
 from report.planner_and_actor import acting_section
 from report.results import Results
 from report.runs import read_runs
@@ -96,9 +97,12 @@ def make_report(config: ReportConfig) -> Report:
             f"{len(folders.problems)}; the first says: {folders.problems[0]}",
         )
     chosen = [run for run in folders.runs if run.label == config.label]
-    results = Results(chosen)
+    every = read_planned(Path(config.runs))
+    planned = every.of(config.label)
+    results = Results(chosen, planned)
     sections = [
         _make("The paper's claims", lambda: claims_section(results), problems),
+        _make("Planned and done", lambda: planned_section(planned, chosen), problems),
         _make("Soundness", lambda: soundness(chosen), problems),
         _make("Main table", lambda: main_table(results), problems),
         _make("Learning curves", lambda: learning_curves(results), problems),
@@ -108,7 +112,7 @@ def make_report(config: ReportConfig) -> Report:
         _make("Generalization", lambda: generalization(results), problems),
         _make("TD3 in imagination", lambda: imagined_curves(results), problems),
         _make("Sensitivity", lambda: sensitivity(trials), problems),
-        _make("PhIHP, planner and actor", lambda: acting_section(chosen), problems),
+        _make("PhIHP, planner and actor", lambda: acting_section(chosen, planned), problems),
         _make(
             "From nothing to the published return",
             lambda: time_to_return(chosen, Path(config.benchmarks)),
@@ -125,7 +129,7 @@ def make_report(config: ReportConfig) -> Report:
     write_report(Path(config.out), "Report", introduction, sections)
     if config.overview is not None:
         Path(config.overview).parent.mkdir(parents=True, exist_ok=True)
-        Path(config.overview).write_text(overview(folders.runs))
+        Path(config.overview).write_text(overview(folders.runs, every))
     if config.page is not None and chosen:
         fill_page(Path(config.page), chosen)
     return Report(tuple(sections), tuple(problems))

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from report.runs import Run
 
 MIXED = "mixed"
-"""What stands for a p-value or a verdict where a cell has runs of several configurations."""
+"""What stands for a p-value or a verdict where :func:`is_mixed` says so of what is compared."""
 
 
 def cells(runs: Iterable[Run]) -> dict[tuple[str, str, int], list[Run]]:
@@ -25,8 +25,11 @@ def configurations(cell: Iterable[Run]) -> int:
 
 
 def is_mixed(runs: Iterable[Run]) -> bool:
-    """Whether any cell of these runs is of several configurations, so that no number of it counts.
+    """Whether these runs cannot be compared, for their settings or their episodes.
 
-    The seed of the evaluation, ``evaluate.first_seed``, is part of a configuration.
+    A cell of several configurations has no number that counts, and two cells that were evaluated
+    by different seeds, ``evaluate.first_seed``, have not met the same episodes.
     """
-    return any(configurations(cell) > 1 for cell in cells(runs).values())
+    runs = tuple(runs)
+    several = any(configurations(cell) > 1 for cell in cells(runs).values())
+    return several or len({run.first_seed for run in runs}) > 1

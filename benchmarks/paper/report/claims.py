@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import NamedTuple
 
 from measures import (
     FEWEST_SEEDS,
@@ -50,6 +51,24 @@ SHOWN, NOT_SHOWN, REFUTED, NOT_RUN = "shown", "not shown", "refuted", "not run"
 _PAIRS = ((TD3_IM_PH, TD3_IM_DD), (PH_CEM, DD_CEM), (PH_TD_MPC_STAR, TD_MPC_STAR))
 
 
+class _Pair(NamedTuple):
+    """A comparison of mean returns, as it is tested in its family.
+
+    Attributes:
+        what: its name.
+        task: whose returns they are.
+        gap: the difference; ``None`` where a side has no run.
+        seeds: of either side, as a finding has them.
+        planned: whether grids were asked for both sides.
+    """
+
+    what: str
+    task: str
+    gap: Difference | None
+    seeds: str
+    planned: bool
+
+
 @dataclass(frozen=True)
 class Finding:
     """What one comparison says on a claim.
@@ -57,11 +76,12 @@ class Finding:
     Args:
         what: the task, or the systems and the task.
         verdict: :data:`SHOWN`, :data:`NOT_SHOWN` or :data:`REFUTED`, or
-            :data:`~report.cells.MIXED` where runs of several configurations are compared.
+            :data:`~report.cells.MIXED` where runs are compared that cannot be, or :data:`NOT_RUN`
+            where a side was planned and has no run.
         effect: its size, in words.
         ends: what the effect lies between, where it is known by its ends alone.
         interval: its 95 % interval over training seeds.
-        seeds: number of training seeds on either side.
+        seeds: number of training seeds on either side, and of how many where more were planned.
     """
 
     what: str
@@ -105,12 +125,12 @@ def sentence(findings: Sequence[Finding]) -> str:
     total = len(findings)
     parts = [
         f"{verdict} in {counts[verdict]}"
-        for verdict in (SHOWN, NOT_SHOWN, REFUTED, MIXED)
+        for verdict in (SHOWN, NOT_SHOWN, REFUTED, MIXED, NOT_RUN)
         if counts[verdict]
     ]
     named = "; ".join(
         f"{verdict}: {', '.join(f.what for f in findings if f.verdict == verdict)}"
-        for verdict in (SHOWN, REFUTED, MIXED)
+        for verdict in (SHOWN, REFUTED, MIXED, NOT_RUN)
         if counts[verdict]
     )
     return f"{', '.join(parts)} of {total} comparisons{f' ({named})' if named else ''}."
@@ -121,9 +141,10 @@ def fewer_samples(results: Results) -> list[Finding]:
     findings = []
     for task in TASKS:
         ours, theirs = (efficiency_of_seeds(results, one, task) for one in (PHIHP, TD_MPC))
+        scores = [results.scores(one, task) for one in (PHIHP, TD_MPC)]
+        seeds = _seeds(results, (PHIHP, TD_MPC), task, (ours, theirs), scores)
         if ours and theirs:
             between = mean_between(theirs), mean_between(ours)
-            compared_scores = [s for one in (PHIHP, TD_MPC) for s in results.scores(one, task)]
             findings.append(
                 _of_ratio(
                     task,
@@ -131,17 +152,25 @@ def fewer_samples(results: Results) -> list[Finding]:
                     ratio_between(*between),
                     FEWER,
                     f"{between[1]} against {between[0]} samples",
-                    compared_scores,
+                    [score for side in scores for score in side],
+                    seeds,
                 )
             )
+        elif results.planned.both(PHIHP, TD_MPC, task):
+            findings.append(_not_run(task, seeds))
     return findings
 
 
 def planning_improves(results: Results) -> list[Finding]:
     """Agent less actor at the usual number of samples, by task."""
-    groups = usual_groups(results.runs)
-    found = {task: planning_gain(groups[task]) for task in groups if task in TASKS}
-    return _of_differences(found, {task: task for task in found})
+    groups, pairs = usual_groups(results.runs), []
+    for task in TASKS:
+        group = groups.get(task, [])
+        planned = results.planned.seeds(PHIHP, task, group)
+        seeds = ", ".join([_of_planned(len(group), planned)] * 2)
+        gap = planning_gain(group) if group else None
+        pairs.append(_Pair(task, task, gap, seeds, planned > 0))
+    return _of_differences(pairs)
 
 
 def faster(results: Results) -> list[Finding]:
@@ -150,6 +179,7 @@ def faster(results: Results) -> list[Finding]:
     for task in TASKS:
         scores = [results.usual(system, task) for system in (PHIHP, TD_MPC)]
         ours, theirs = (_times(each) for each in scores)
+        seeds = _seeds(results, (PHIHP, TD_MPC), task, (ours, theirs), scores)
         if ours and theirs:
             findings.append(
                 _of_ratio(
@@ -159,41 +189,46 @@ def faster(results: Results) -> list[Finding]:
                     1.0,
                     f"{fmean(ours):.1f} ms against {fmean(theirs):.1f}",
                     [score for side in scores for score in side],
+                    seeds,
                 )
             )
+        elif results.planned.both(PHIHP, TD_MPC, task):
+            findings.append(_not_run(task, seeds))
     return findings
 
 
 def _higher(results: Results, pairs: Iterable[tuple[PaperSystem, PaperSystem]]) -> list[Finding]:
     """Mean returns of pairs; at the same samples where they are ablations of each other."""
-    found: dict[str, Difference] = {}
-    tasks: dict[str, str] = {}
+    found = []
     for first, second in pairs:
         for task in TASKS:
-            ours, theirs = results.usual(first, task), results.usual(second, task)
+            sides = results.usual(first, task), results.usual(second, task)
             if first is not PHIHP:
-                ours, theirs = _at_equal_samples(results, first, second, task)
-            gap = compared(ours, theirs)
-            if gap is not None:
-                what = task if first is PHIHP else f"{first.name} on {task}"
-                found[what], tasks[what] = gap, task
-    return _of_differences(found, tasks)
+                sides = _at_equal_samples(results, first, second, task)
+            what = task if first is PHIHP else f"{first.name} on {task}"
+            seeds = _seeds(results, (first, second), task, sides, sides)
+            planned = results.planned.both(first, second, task)
+            found.append(_Pair(what, task, compared(*sides), seeds, planned))
+    return _of_differences(found)
 
 
-def _of_differences(found: dict[str, Difference], tasks: dict[str, str]) -> list[Finding]:
-    """Findings of one family of tests, by Holm; mixed ones are not tested."""
+def _of_differences(pairs: Sequence[_Pair]) -> list[Finding]:
+    """Findings of one family of tests, by Holm; those that were planned count, tested or not."""
     findings = []
-    adjusted = holm([gap.p for gap in found.values()])
-    for (what, gap), p in zip(found.items(), adjusted, strict=True):
+    p_values = [math.nan if pair.gap is None else pair.gap.p for pair in pairs]
+    family = sum(pair.planned or not math.isnan(p) for pair, p in zip(pairs, p_values, strict=True))
+    for (what, task, gap, seeds, planned), p in zip(pairs, holm(p_values, family), strict=True):
+        if gap is None:
+            findings += [_not_run(what, seeds)] if planned else []
+            continue
         verdict = NOT_SHOWN if not p < LEVEL else SHOWN if gap.mean > 0 else REFUTED
         if gap.mixed:
             verdict = MIXED
         effect = _text(gap.mean, "+") + ("" if math.isnan(p) else f", p = {p:.2g}")
-        within = margin(tasks[what])
+        within = margin(task)
         if verdict == NOT_SHOWN and within is not None and gap.within(within):
             effect += ", equivalent"
         ends = "–" if math.isnan(gap.low) else f"{_text(gap.low)} to {_text(gap.high)}"
-        seeds = f"{gap.seeds[0]}, {gap.seeds[1]}"
         findings.append(Finding(what, verdict, effect, "–", ends, seeds))
     return findings
 
@@ -205,6 +240,7 @@ def _of_ratio(
     least: float,
     effect: str,
     scores: Iterable[Score],
+    seeds: str,
 ) -> Finding:
     """Shown where the ratio is at least ``least`` by its ends and by its interval, or refuted.
 
@@ -218,19 +254,50 @@ def _of_ratio(
         least: the claim is that it is this or more.
         effect: its size, in words.
         scores: those of either side, which may be mixed.
+        seeds: of either side, as a finding has them.
     """
-    interval, seeds = ratio_interval(*sides), (len(sides[1]), len(sides[0]))
+    interval = ratio_interval(*sides)
     verdict = NOT_SHOWN
     if is_mixed(score.run for score in scores):
         verdict = MIXED
-    elif min(seeds) >= FEWEST_SEEDS:
+    elif min(map(len, sides)) >= FEWEST_SEEDS:
         if ratio.low >= least and interval.low > least:
             verdict = SHOWN
         elif ratio.high < least and interval.high < least:
             verdict = REFUTED
-    return Finding(
-        what, verdict, effect, _times_text(ratio), _times_text(interval), f"{seeds[0]}, {seeds[1]}"
+    return Finding(what, verdict, effect, _times_text(ratio), _times_text(interval), seeds)
+
+
+def _not_run(what: str, seeds: str) -> Finding:
+    """That of a comparison that was planned, of which a side has no run."""
+    return Finding(what, NOT_RUN, "–", "–", "–", seeds)
+
+
+def _seeds(
+    results: Results,
+    systems: tuple[PaperSystem, PaperSystem],
+    task: str,
+    values: tuple[Sequence[object], Sequence[object]],
+    scores: Sequence[Sequence[Score]],
+) -> str:
+    """The seeds of either side, such as ``7 of 10, 10``.
+
+    Args:
+        results: with the plan.
+        systems: the two sides.
+        task: name of the task.
+        values: one for each seed, by side.
+        scores: those that they are from, whose numbers of samples count.
+    """
+    planned = (
+        results.planned.seeds(system, task, [score.run for score in side])
+        for system, side in zip(systems, scores, strict=True)
     )
+    return ", ".join(_of_planned(len(side), n) for side, n in zip(values, planned, strict=True))
+
+
+def _of_planned(found: int, planned: int) -> str:
+    return f"{found} of {planned}" if planned > found else str(found)
 
 
 def _times_text(ratio: Between) -> str:

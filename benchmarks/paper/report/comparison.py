@@ -14,7 +14,7 @@ from report.tables import Number, TableCell
 
 
 def unless_mixed(found: Difference, runs: Iterable[Run]) -> Difference:
-    """The difference, without a p-value if it is of runs of which a cell is mixed."""
+    """The difference, without a p-value if its runs cannot be compared."""
     return replace(found, p=math.nan, mixed=True) if is_mixed(runs) else found
 
 

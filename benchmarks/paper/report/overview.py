@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from report.planned import Planned
 from report.planner_and_actor import acting_section, returns_markdown
 from report.runs import Run
 from report.write import section_markdown
@@ -13,8 +14,9 @@ START, END = "<!-- results:start -->", "<!-- results:end -->"
 """Between these a page has the table of returns."""
 
 
-def overview(runs: Sequence[Run]) -> str:
+def overview(runs: Sequence[Run], planned: Planned | None = None) -> str:
     """The page, as Markdown."""
+    planned = planned or Planned()
     labels = sorted({run.label for run in runs}, key=lambda label: (label != "default", label))
     parts = [
         "# Results\n\nMade by `python benchmarks/paper/make_report.py` from `results/runs/`. "
@@ -33,7 +35,7 @@ def overview(runs: Sequence[Run]) -> str:
             f"{origins(chosen)}\n",
             "### Returns at the default preset's number of real samples, else at the most\n",
             returns_markdown(chosen),
-            section_markdown(acting_section(chosen), level=2, title=False),
+            section_markdown(acting_section(chosen, planned.of(label)), level=2, title=False),
         ]
     if len(parts) == 1:
         parts.append("No runs yet.\n")

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
-from measures import PUBLISHED_SAMPLES, Difference, agent_in, holm, paired_difference_of_seeds
+from measures import (
+    DEFAULT_SAMPLES,
+    PUBLISHED_SAMPLES,
+    Difference,
+    agent_in,
+    holm,
+    paired_difference_of_seeds,
+)
 from phihp_torchrl.evaluation import TARGETS, TaskResult, returns_table
 from report.comparison import numbers, unless_mixed
 from report.paper_systems import AGENT
+from report.planned import Planned
 from report.results import usual_samples
 from report.runs import Run
 from report.sections import Section
@@ -67,8 +76,9 @@ def planning_gain(group: Sequence[Run]) -> Difference:
     return unless_mixed(found, group)
 
 
-def acting_section(runs: Sequence[Run]) -> Section:
+def acting_section(runs: Sequence[Run], planned: Planned | None = None) -> Section:
     """The tables on planning's gain, fewer samples and time."""
+    planned = planned or Planned()
     groups = both_ways(runs)
     return Section(
         "PhIHP, planner and actor",
@@ -77,16 +87,19 @@ def acting_section(runs: Sequence[Run]) -> Section:
         "exploratory here, with p-values adjusted by Holm over the table; it is judged under *The "
         "paper's claims*. The times are means, those of plans over the seeds that plan.",
         {
-            "What planning adds to the actor, the same episodes": _gain_table(groups),
+            "What planning adds to the actor, the same episodes": _gain_table(groups, planned),
             "Returns with fewer real samples": _samples_table(groups),
             "Time": _time_table(groups),
         },
     )
 
 
-def _gain_table(groups: dict[tuple[str, int], list[Run]]) -> Table:
+def _gain_table(groups: dict[tuple[str, int], list[Run]], planned: Planned) -> Table:
     found = {key: planning_gain(group) for key, group in groups.items()}
-    adjusted = holm([gain.p for gain in found.values()])
+    tested = {key for key, gain in found.items() if not math.isnan(gain.p)}
+    asked = {(cell.task, cell.samples or DEFAULT_SAMPLES.get(cell.task))
+             for cell in planned.cells if cell.method == "phihp"}  # fmt: skip
+    adjusted = holm([gain.p for gain in found.values()], len(tested | asked))
     rows: list[list[TableCell]] = [
         [task, str(samples), *numbers(gain, p, 2), str(gain.seeds[0])]
         for ((task, samples), gain), p in zip(found.items(), adjusted, strict=True)

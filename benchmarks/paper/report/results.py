@@ -10,6 +10,7 @@ from measures import DEFAULT_SAMPLES, FEWEST_SEEDS, PUBLISHED_SAMPLES, agent_in
 from phihp_torchrl.evaluation import TARGETS
 from report.bounds import normalise
 from report.paper_systems import AGENT, PaperSystem
+from report.planned import Planned
 from report.runs import Acting, Run
 
 TASKS = tuple(PUBLISHED_SAMPLES)
@@ -95,10 +96,12 @@ class Results:
 
     Args:
         runs: all runs with one label.
+        planned: the cells with that label that grids were asked for.
     """
 
-    def __init__(self, runs: Iterable[Run]) -> None:
+    def __init__(self, runs: Iterable[Run], planned: Planned | None = None) -> None:
         self.runs = tuple(runs)
+        self.planned = planned or Planned()
 
     @property
     def others(self) -> tuple[str, ...]:

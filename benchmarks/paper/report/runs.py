@@ -15,8 +15,9 @@ from typing import Any
 import yaml
 
 from grid.cell import DEFAULT_METHOD
+from grid.status import read_failure
 from measures import CurvePoint, configuration_hash, curve_from_metrics, read_curve
-from phihp_torchrl.evaluation import BASELINES_KEY
+from phihp_torchrl.evaluation import BASELINES_KEY, EVALUATION_SEED
 from phihp_torchrl.origin import commit_text, machine_text
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # a report reads hundreds of files
@@ -57,6 +58,8 @@ class Run:
         commits: abbreviated, of all its sessions: a run that was resumed may have several.
         dirty: whether the source had been changed in any session; ``None`` where that of one is
             unknown and no other was.
+        first_seed: the seed of the episodes that it was evaluated in.
+        threads: how many it computed with.
         machine: what it ran on.
         seconds: time of each phase.
         acting: by way of acting, ``"planner"`` or ``"actor"``.
@@ -75,11 +78,18 @@ class Run:
     commit: str
     commits: tuple[str, ...]
     dirty: bool | None
+    first_seed: int
+    threads: int
     machine: str
     seconds: Mapping[str, float]
     acting: Mapping[str, Acting]
     curve: tuple[CurvePoint, ...]
     prediction: Mapping[str, float]
+
+    @property
+    def core_hours(self) -> float:
+        """Its recorded time, times its threads."""
+        return sum(self.seconds.values()) * self.threads / 3600
 
 
 @dataclass(frozen=True)
@@ -126,6 +136,8 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
     """
     if missing := [n for n in ("config.yaml", "metadata.json", "evaluation.json", "metrics.csv")
                    if not (folder / n).is_file()]:  # fmt: skip
+        if (failure := folder / "failure.json").is_file():
+            raise ValueError(f"the run failed: {read_failure(failure)}")
         raise ValueError(f"the run is not finished: {', '.join(missing)} is missing.")
     config = yaml.load((folder / "config.yaml").read_text(), Loader=_LOADER)
     metadata = _read_json(folder / "metadata.json")
@@ -149,6 +161,9 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
         commit=commit_text(session),
         commits=tuple(sorted({str(one["commit"])[:7] for one in metadata["sessions"]})),
         dirty=_dirty([one.get("dirty") for one in metadata["sessions"]]),
+        # What runs of earlier versions do not say was the same for all of them.
+        first_seed=int((config.get("evaluate") or {}).get("first_seed", EVALUATION_SEED)),
+        threads=int(config.get("threads") or 1),
         machine=machine_text(session),
         seconds={str(k): float(v) for k, v in metadata["seconds"].items()},
         acting=_acting(_read_json(folder / "evaluation.json")),

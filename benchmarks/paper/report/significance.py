@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from scipy import stats
 
@@ -39,11 +40,12 @@ def significance(results: Results) -> Section:
         compared(results.usual(PHIHP, task), results.usual(baseline, task))
         for task, baseline in pairs
     ]
+    asked = [results.planned.both(PHIHP, baseline, task) for task, baseline in pairs]
     printed = [published_difference(task, baseline.name) for task, baseline in pairs]
     rows: list[list[TableCell]] = [
         [f"{task}, {baseline.name}", *_cells(found, p, NOT_RUN), *_cells(theirs, their_p, "–")]
         for (task, baseline), found, p, theirs, their_p in zip(
-            pairs, own, _adjusted(own), printed, _adjusted(printed), strict=True
+            pairs, own, _adjusted(own, asked), printed, _adjusted(printed), strict=True
         )
     ]
     header = ["task, PhIHP less", "difference", "95 % from", "to", "p", "seeds"]
@@ -52,16 +54,20 @@ def significance(results: Results) -> Section:
         "PhIHP against each baseline",
         "Exploratory: what is judged is under *The paper's claims*. Differences of mean returns "
         "over training seeds, with Welch's intervals. p-values are adjusted by Holm over all rows "
-        f"here, and below {FEWEST_SEEDS} seeds or without any spread there is none, nor where a "
-        "cell is *mixed*, of several configurations. Under *published*, the same from "
+        f"here that are tested or were planned, and below {FEWEST_SEEDS} seeds or without any "
+        "spread there is none, nor where cells are *mixed*, of several configurations or of "
+        "different episodes. Under *published*, the same from "
         f"the published means and standard deviations of {_PUBLISHED_RUNS} runs each, a family of "
         "its own; the paper's own table has larger t, as more values than ten would give.",
         {"Differences": Table("differences", header, rows)},
     )
 
 
-def _adjusted(found: list[Difference | None]) -> list[float]:
-    return holm([math.nan if one is None else one.p for one in found])
+def _adjusted(found: list[Difference | None], planned: Sequence[bool] = ()) -> list[float]:
+    """Adjusted for all that are tested, and for those planned that could not be."""
+    p_values = [math.nan if one is None else one.p for one in found]
+    tested = [not math.isnan(p) for p in p_values]
+    return holm(p_values, sum(map(any, zip(tested, planned or tested, strict=True))))
 
 
 def _cells(found: Difference | None, p: float, short: str) -> list[TableCell]:

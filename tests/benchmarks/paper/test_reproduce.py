@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,8 @@ from brief import shorten
 from grid_cells import TINY, do
 
 import reproduce
-from grid import CellFiles, GridConfig, Status
+from grid import CellFiles, CellState, GridConfig, Status
+from phihp_torchrl.config import ConfigError
 
 
 @pytest.fixture(scope="module")
@@ -61,3 +63,52 @@ def test_a_run_that_is_not_there_is_named(
     with pytest.raises(SystemExit):
         reproduce.main()
     assert "acrobot-default-n2500-seed99: expected a committed run" in capsys.readouterr().err
+
+
+def asked_for(
+    monkeypatch: pytest.MonkeyPatch, kept: Path, *words: str, error: Exception | None = None
+) -> GridConfig:
+    """The cell that the script would run."""
+    configs: list[GridConfig] = []
+
+    def work(config: GridConfig, root: Path) -> CellState:
+        configs.append(config)
+        if error is not None:
+            raise error
+        return CellState(Status.FAILED, "not run")
+
+    monkeypatch.setattr(reproduce, "work", work)
+    monkeypatch.setattr(sys, "argv", ["reproduce.py", *words, "--runs", str(kept)])
+    with pytest.raises(SystemExit):
+        reproduce.main()
+    return configs[0]
+
+
+def keep(kept: Path, name: str, **cell: bool) -> None:
+    (kept / name).mkdir(parents=True)
+    (kept / name / "evaluation.json").write_text("{}")
+    if cell:
+        (kept / name / "cell.json").write_text(json.dumps(cell))
+
+
+def test_a_cell_has_the_settings_that_its_grid_gave_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep(tmp_path, "acrobot-td3-default-seed0")
+    words = ("acrobot", "--method", "td3", "--overrides", "compile=false")
+    config = asked_for(monkeypatch, tmp_path, *words)
+    assert "td3.real_steps=300000" in config.words()
+    assert "compile=false" in config.words()
+    assert not config.proof
+
+
+def test_a_cell_of_the_proof_plays_the_episodes_of_the_proof(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for seed, proof in ((100, True), (101, False)):
+        keep(tmp_path, f"acrobot-default-n2500-seed{seed}", proof=proof)
+        config = asked_for(monkeypatch, tmp_path, "acrobot", "--seed", str(seed))
+        assert (config.proof, config.allow_dirty) == (proof, not proof)
+    dirty = ConfigError("allow_dirty", "expected a tree without uncommitted changes.")
+    asked_for(monkeypatch, tmp_path, "acrobot", "--seed", "100", error=dirty)
+    assert "acrobot-default-n2500-seed100: allow_dirty: expected" in capsys.readouterr().err

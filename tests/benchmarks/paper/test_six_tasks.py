@@ -7,11 +7,12 @@ import math
 from dataclasses import replace
 
 import pytest
+from grid_cells import ROOT
 from kept_runs import make_run
 
 import six_tasks
-from measures import CurvePoint
-from report.runs import read_runs
+from measures import CurvePoint, agent_in
+from report.runs import read_run, read_runs
 
 
 def test_reporting_seeds_of_the_default_alone_count(tmp_path):
@@ -65,3 +66,13 @@ def test_time_to_the_published_return_is_that_of_the_first_actor_to_earn_it(tmp_
     first = six_tasks.brief([run]).splitlines()[2]
     assert first.startswith("| pendulum | 1 | ")
     assert first.endswith("| -263 ± 144 | 2,000 |")
+
+
+def test_aims_are_the_returns_of_the_runs_that_their_file_names():
+    source = json.loads((ROOT / "benchmarks" / "paper" / "aims.json").read_text())
+    assert "results/runs/<task>-default-n<real_steps>-seed<0-4>" in source["source"]
+    for task, aim in source["tasks"].items():
+        names = (f"{task}-default-n{aim['real_steps']}-seed{seed}" for seed in range(5))
+        runs = [read_run(ROOT / "results" / "runs" / name, any_version=True) for name in names]
+        mean = sum(run.acting[agent_in(run.acting)].mean for run in runs) / len(runs)
+        assert round(mean, 1) == six_tasks.AIMS[task]

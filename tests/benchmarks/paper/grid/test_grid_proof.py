@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 from grid_cells import TINY, do
 
 from grid import GridConfig, Status, committed
@@ -76,10 +77,20 @@ def test_a_proof_plays_the_episodes_that_are_kept_for_it(
         replace(proof, seed=99)
 
 
+def test_no_idle_core_has_a_say_in_a_proof(config: GridConfig, proof: GridConfig) -> None:
+    assert "evaluate.packaged=false" in proof.words()
+    assert not any("packaged" in word for word in config.words())
+    state = do(replace(proof, overrides=(*TINY, "evaluate.packaged=auto")))
+    assert state.status is Status.FAILED
+    assert "evaluate.packaged: expected true or false with proof=true, got auto" in state.detail
+
+
 def test_a_proof_is_of_one_commit(proof: GridConfig, clone: Path) -> None:
     files = proof.files(Path())
     assert do(proof).status is Status.DONE
     assert json.loads((files.kept / "cell.json").read_text())["proof"] is True
+    settings = yaml.safe_load((files.kept / "config.yaml").read_text())
+    assert settings["evaluate"]["packaged"] is False
     assert read_run(files.kept).seed == 100  # a report reads it
     first = str(origin.source_commit())
     git(clone, "commit", "-q", "--allow-empty", "-m", "second")

@@ -51,7 +51,9 @@ def test_the_planned_cells_of_all_commands_are_noted(config: GridConfig, tmp_pat
     keep_names([*cells(1, 0), *elsewhere])
     keep_names(cells(2, 1))
     names = [files.cell.name for files in cells(0, 1, 2)]
-    assert json.loads((Path(config.results) / "planned.json").read_text()) == names
+    noted = json.loads((Path(config.results) / "planned.json").read_text())
+    assert [*noted] == names
+    assert [Cell(**cell) for cell in noted.values()] == [f.cell for f in cells(0, 1, 2)]
     assert len(json.loads(elsewhere[0].planned.read_text())) == 1
 
 

@@ -168,3 +168,26 @@ def test_equal_samples_are_those_with_enough_seeds(tmp_path: Path) -> None:
         make_run(tmp_path, method, samples=5000, acting={"planner": [1.0]})
     rows = claims_section(results(tmp_path)).tables["Comparisons"].rows
     assert [(row[0], row[-1]) for row in rows] == [("4, Ph-CEM on pendulum", "3, 3")]
+
+
+def test_cells_of_other_episodes_are_not_compared(tmp_path: Path) -> None:
+    """Each cell is of one configuration, and one of them was evaluated by another seed."""
+    runs = tmp_path / "runs"
+    for seed in (100, 101, 102):
+        more = 0.1 * (seed - 100)
+        acting = {"planner": [9.0 + more], "actor": [1.0 - more**2]}
+        config = make_run(runs, seed=seed, acting=acting) / "config.yaml"
+        config.write_text(config.read_text() + "evaluate: {first_seed: 2000000}\n")
+        make_run(runs, "td3", seed=seed, samples=300, acting={"actor": [5.0 + more]})
+        acting = {"planner": [8.0 - more]}
+        make_run(runs, "td-mpc", seed=seed, samples=9000, acting=acting, ms=90.0)
+    rows = claims_section(results(runs)).tables["Comparisons"].rows
+    assert {str(row[0]): row[1] for row in rows} == {
+        "1, pendulum": "mixed",
+        "2, pendulum": "mixed",
+        "3, pendulum": "shown",  # planner and actor of one cell
+        "5, pendulum": "mixed",
+    }
+    make(tmp_path)
+    compared = [row for row in table(tmp_path, "differences") if row["seeds"] == "3, 3"]
+    assert [row["p"] for row in compared] == ["mixed", "mixed"]

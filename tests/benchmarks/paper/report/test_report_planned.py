@@ -1,0 +1,128 @@
+"""What was planned, and what a report says where it is not there."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from kept_runs import make, make_run, table, text
+
+from grid.cell import Cell, CellFiles
+from grid.keep import keep_failure, keep_names
+from measures import holm
+from phihp_torchrl.config import ConfigError
+from report import Results, read_runs
+from report.claims import claims_section
+from report.planned import planned_section, read_planned
+
+
+def make_planned(runs: Path, *cells: Cell) -> None:
+    """Runs of these cells, in folders with their names, where nothing of them is there."""
+    for i, cell in enumerate(cells):
+        means = {"planner": [9.0 + 0.1 * i], "actor": [1.0 - 0.3 * i**2]}
+        samples = cell.samples or 1000
+        folder = make_run(runs, cell.method, cell.task, cell.seed, samples, acting=means)
+        folder.rename(runs / cell.name)
+
+
+def plan(runs: Path, *cells: Cell) -> None:
+    keep_names([CellFiles(cell, runs.parent / "full", runs) for cell in cells])
+
+
+def fail(runs: Path, cell: Cell, error: str) -> None:
+    record = {"error": error, "when": "now", "commit": None}
+    keep_failure(CellFiles(cell, runs.parent / "full", runs), record)
+
+
+def seeds(method: str = "phihp", task: str = "pendulum", count: int = 3) -> list[Cell]:
+    return [Cell(method, task, 100 + seed, 1000) for seed in range(count)]
+
+
+def rows(runs: Path) -> dict[str, list[str]]:
+    """The claims' comparisons by name."""
+    found = Results(read_runs(runs).runs, read_planned(runs))
+    table = claims_section(found).tables["Comparisons"]
+    return {str(row[0]): [str(cell) for cell in row[1:]] for row in table.rows}
+
+
+def test_cells_that_failed_or_are_missing_are_counted_with_their_reason(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    cells = seeds(count=10)
+    make_planned(runs, *cells[:7])
+    plan(runs, *cells, *seeds("td3", count=2), Cell("phihp", "acrobot", 100, 5, "other"))
+    for cell in cells[7:9]:
+        fail(runs, cell, "ValueError: a | b")
+    made = make(tmp_path)
+    found = {row["task, method, real samples"]: row for row in table(tmp_path, "planned")}
+    assert {name: row["done of planned"] for name, row in found.items()} == {
+        "pendulum, phihp, 1000": "7 of 10; 2 failed: ValueError: a / b, 1 missing",
+        "pendulum, td3, 1000": "0 of 2; 2 missing",
+    }
+    hours = float(found["pendulum, phihp, 1000"]["core-hours"])
+    assert hours == pytest.approx(7 * 31.0 / 3600)  # one thread
+    assert text(made, "Planned and done").startswith("7 of 12 planned cells are done. All runs")
+    assert sum("the run failed: ValueError: a | b" in problem for problem in made.problems) == 2
+    assert rows(runs)["3, pendulum"][-1] == "7 of 10, 7 of 10"
+
+
+def test_core_hours_are_of_all_threads(tmp_path: Path) -> None:
+    config = make_run(tmp_path) / "config.yaml"
+    config.write_text(config.read_text() + "threads: 4\n")
+    runs = read_runs(tmp_path).runs
+    assert runs[0].core_hours == pytest.approx(4 * 31.0 / 3600)
+    section = planned_section(read_planned(tmp_path), runs)
+    assert section.text.startswith("No plan: there is no `planned.json`")
+    assert not section.tables
+
+
+def test_what_was_planned_and_is_missing_counts_in_the_family(tmp_path: Path) -> None:
+    make_planned(tmp_path, *seeds(count=4))
+    p = float(rows(tmp_path)["3, pendulum"][1].split("p = ")[1])
+    tasks = ("pendulum", "acrobot", "cartpole")
+    plan(tmp_path, *(cell for task in tasks for cell in seeds(task=task, count=4)))
+    found = rows(tmp_path)
+    assert float(found["3, pendulum"][1].split("p = ")[1]) == pytest.approx(3 * p, rel=0.05)
+    assert found["3, acrobot"] == ["not run", "–", "–", "–", "0 of 4, 0 of 4"]
+    assert "3, cartpole-swingup" not in found
+    make(tmp_path, tmp_path)
+    (gain,) = table(tmp_path, "planning_gain")
+    assert float(gain["p"]) == pytest.approx(3 * p, rel=0.05)
+
+
+def test_a_side_that_was_planned_and_is_missing_is_named(tmp_path: Path) -> None:
+    make_planned(tmp_path, *seeds())
+    plan(tmp_path, *seeds(count=4), *seeds("td3"), *seeds("td-mpc"))
+    found = rows(tmp_path)
+    for claim in (1, 2, 5):
+        verdict, *_, n = found[f"{claim}, pendulum"]
+        assert (verdict, n) == ("not run", "3 of 4, 0 of 3")
+    text = claims_section(Results(read_runs(tmp_path).runs, read_planned(tmp_path))).text
+    assert "not run in 1 of 1 comparisons (not run: pendulum)" in text
+
+
+def test_baselines_that_were_planned_count_in_the_table_of_differences(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    make_planned(runs, *seeds(count=4), *(Cell("td3", "pendulum", s, 1000) for s in range(3)))
+    make(tmp_path)
+    (before,) = (row["p"] for row in table(tmp_path, "differences") if row["seeds"] == "4, 3")
+    plan(runs, *seeds(count=4), *seeds("td-mpc"))
+    make(tmp_path)
+    (after,) = (row["p"] for row in table(tmp_path, "differences") if row["seeds"] == "4, 3")
+    assert float(after) == pytest.approx(min(1.0, 2 * float(before)))
+
+
+def test_a_plan_that_cannot_be_read_ends_the_report(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    make_run(runs)
+    for torn in ('["pendulum-default-seed0"]', "{"):
+        (runs / "planned.json").write_text(torn)
+        with pytest.raises(ConfigError, match=r"^runs: expected a description of each cell"):
+            make(tmp_path)
+    assert not (tmp_path / "report").exists()
+
+
+def test_no_p_value_falls_as_a_family_grows() -> None:
+    p_values = [0.04, math.nan, 0.01]
+    assert holm(p_values, family=5) == pytest.approx([0.16, math.nan, 0.05], nan_ok=True)
+    assert holm(p_values, family=1) == pytest.approx(holm(p_values), nan_ok=True)
