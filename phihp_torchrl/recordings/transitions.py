@@ -25,6 +25,7 @@ def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
 
     A transition is left out, and counted in the log, where a state is unknown before or after it,
     and where its command is beyond the bounds or the rate of the task, which a model would clip.
+    The physics know of no reference: where the task has one, it stands in the middle of its range.
 
     Args:
         task: the task, which says what was earned and where an episode ends.
@@ -36,8 +37,8 @@ def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
         ``[N, 1]``, float32, in order. ``"done"`` marks the last transition before an interruption.
 
     Raises:
-        ConfigError: for recordings of another system, a state that was never measured, and if
-            nothing is left.
+        ConfigError: for recordings of another system, a state that was never measured, a task with
+            inputs, which recordings do not have, and if nothing is left.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -61,28 +62,28 @@ def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
     return torch.cat(parts)
 
 
-def observations(task: Task, recording: Recording) -> Tensor:
-    """What the task observes at each sample, float64 ``[T, o]``.
+def _states(task: Task, recording: Recording) -> Tensor:
+    """The task's state at each sample, float64 ``[T, n]``.
 
-    This is the only place where a sample of a log becomes an observation: what a task adds to the
-    physical state, from the commands so far, belongs here.
+    This is the only place where a sample of a log becomes a state: what a task adds to the physical
+    one, from the commands so far, belongs here.
     """
     if not task.register_count:
-        return task.observe(recording.state)
+        return recording.state
     held = torch.cat([recording.intervals, recording.intervals[-1:]])
     commands = task.clip_action(recording.action)
     rest = task.clip_action(torch.zeros_like(commands[0]))
     _, registers = task.registers.along(commands, held, rest)
-    return task.observe(torch.cat([recording.state, registers], -1))
+    return torch.cat([recording.state, registers], -1)
 
 
 def _check(task: Task, recordings: Sequence[Recording]) -> None:
     names = task.system.state_names
-    if task.outside:
+    if task.inputs is not None:
         raise ConfigError(
             "recordings",
-            f"task {task.name!r} has {list(task.outside.signals)}, which a recording does not "
-            "have; learn its model from recordings by a task without.",
+            f"task {task.name!r} has inputs {task.inputs.names}, which a recording does not have; "
+            "learn its model from recordings by a task without.",
         )
     check_columns(task.system, recordings)
     measured = torch.stack([log.measured for log in recordings]).any(0) if recordings else ()
@@ -103,7 +104,8 @@ def _goes_on(log: Recording, before: Recording | None) -> bool:
 
 def _of(task: Task, log: Recording, goes_on: bool, left: Counter[str]) -> TensorDict:
     """The transitions of a stretch; one that goes on starts in the middle of an episode."""
-    observation, action = observations(task, log), log.action[:-1]
+    state, action = _states(task, log), log.action[:-1]
+    observation = task.observe(state)
     low = log.action.new_tensor(task.action_low or ())
     high = log.action.new_tensor(task.action_high)
     slack = _SLACK * (high - low)
@@ -127,11 +129,11 @@ def _of(task: Task, log: Recording, goes_on: bool, left: Counter[str]) -> Tensor
     left -= Counter()  # drops the zeros
     use = ~(unknown | outside)
     at = use.nonzero()[:, 0]
-    state, following = log.state[:-1][use], log.state[1:][use]
+    before, after = state[:-1][use].float(), state[1:][use].float()
     done = torch.ones(len(at), 1, dtype=torch.bool)
     done[:-1, 0] = at.diff() > 1
-    reward = task.reward(state.float(), action[use].float(), following.float())
     command = task.clip_action(action[use].float())
+    reward = task.earned(before, command, after)
     return TensorDict(
         observation=observation[:-1][use].float(),
         action=command,
@@ -140,7 +142,7 @@ def _of(task: Task, log: Recording, goes_on: bool, left: Counter[str]) -> Tensor
             observation=observation[1:][use].float(),
             reward=reward[:, None],
             done=done,
-            terminated=task.is_terminated(following.float(), command)[:, None],
+            terminated=task.is_terminated(after, command)[:, None],
             batch_size=[len(at)],
         ),
         batch_size=[len(at)],

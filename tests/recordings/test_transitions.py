@@ -8,9 +8,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from phihp_torchrl import Actuator, get_task
+from phihp_torchrl import Actuator, Signal, get_task
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.recordings import Recording, transitions
+from tests.followed import WIND, Mass, followed
 
 PENDULUM = get_task("pendulum")
 
@@ -97,3 +98,22 @@ def test_a_stretch_that_goes_on_lacks_what_was_under_way():
     second = replace(first, time=times + 10.0)
     assert len(transitions(task, [first, second])) == 4 + 2
     assert len(transitions(task, [first, replace(second, episode=1)])) == 4 + 4
+
+
+def test_a_reference_stands_in_the_middle_of_its_range() -> None:
+    def follow(state, action, next_state, reference):
+        return -(next_state[..., 1] - reference[..., 0]).abs()
+
+    asked = Signal(("theta_dot",), low=(0.0,), high=(4.0,), preview=1)
+    task, log = replace(PENDULUM, reward=follow, reference=asked), recording()
+    data = transitions(task, [log])
+    assert torch.allclose(data["next", "reward"][:, 0], -(log.state[1:, 1].float() - 2.0).abs())
+    state = task.locate(data["observation"])
+    assert torch.equal(
+        task.outside.values(task.split(state)[1])["reference"], torch.full((5, 1), 2.0)
+    )
+
+
+def test_inputs_that_no_recording_has_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"has inputs \('wind',\), which a recording does not"):
+        transitions(followed(Mass(), inputs=WIND), [recording()])

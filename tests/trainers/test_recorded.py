@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
-from phihp_torchrl import HybridDynamics
+from phihp_torchrl import HybridDynamics, Signal, load_agent
 from phihp_torchrl.config import METHODS, ConfigError
 from phihp_torchrl.dynamics import FitConfig
 from phihp_torchrl.recordings import Recording
@@ -70,6 +70,19 @@ def test_a_run_learns_from_recordings_and_plays_nowhere(
     assert (tmp_path / "run" / "agent").is_dir()
     assert read_result(tmp_path / "run") is None
     assert run(config, tmp_path / "run", resume=True, world=recorded()).finished
+
+
+def test_an_agent_that_follows_a_reference_is_learned_from_recordings(tmp_path: Path) -> None:
+    def follow(state, action, next_state, reference):
+        return -(next_state[..., 1] - reference[..., 0]).square()
+
+    asked = Signal(("theta_dot",), low=(-1.0,), high=(1.0,), preview=1)
+    task = replace(PENDULUM, name="follow", reward=follow, reference=asked)
+    world = RecordedWorld(task, recorded().recordings)
+    run(replace(CONFIG, task="follow"), tmp_path / "run", world=world)
+    agent = load_agent(tmp_path / "run" / "agent", task=task)
+    given = TensorDict(observation=torch.tensor([1.0, 0.0, 0.0]), reference=torch.tensor([0.5]))
+    assert agent(given)["action"].isfinite().all()
 
 
 def test_methods_that_act_are_refused(tmp_path: Path) -> None:
