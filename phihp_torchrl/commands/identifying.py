@@ -21,6 +21,7 @@ from phihp_torchrl.identification import (
     Finding,
     Identification,
     IdentifyConfig,
+    check_system,
     identify,
     ready_to_paste,
     report_page,
@@ -58,9 +59,7 @@ def identify_as(job: IdentifyJob, words: Sequence[str], config_dir: str | None) 
     shared = [word for word in words if _section(word) in SHARED]
     settings = load_config(overrides=shared, config_dir=config_dir)
     task = find_task(job.task).with_actuator(settings["actuator"])
-    if not task.system.has_prior:
-        name = type(task.system).__name__
-        raise ConfigError("task", f"{name}, the system of {task.name}, has no prior to fit.")
+    check_system(task.system)
     kind = read_kind(WORLDS, settings["world"], "world")
     if isinstance(kind, RecordedConfig):
         data = _read(task, kind)

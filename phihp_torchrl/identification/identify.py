@@ -30,7 +30,25 @@ from phihp_torchrl.identification.verdicts import (
 )
 from phihp_torchrl.identification.windows import Samples, gather
 from phihp_torchrl.recordings import Recording
+from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import Task
+
+
+def check_system(system: System) -> None:
+    """Refuse a system of which there is nothing to fit, or whose inputs would be left out.
+
+    Raises:
+        ConfigError: for a system without a prior or with inputs.
+    """
+    name = type(system).__name__
+    if not system.has_prior:
+        raise ConfigError("system", f"{name} has no prior to fit.")
+    if system.input_names:
+        raise ConfigError(
+            "inputs",
+            f"{name} has inputs {system.input_names}, which are not reckoned with here; fit its "
+            "constants by phase 1 (phihp train, with the columns of its inputs), which does.",
+        )
 
 
 def identify(
@@ -54,8 +72,8 @@ def identify(
         Constants with intervals and verdicts, the actuator, errors, noise and warnings.
 
     Raises:
-        ConfigError: for a system without a prior, recordings that do not fit to the task, or too
-            few samples.
+        ConfigError: for a system without a prior or with inputs, recordings that do not fit to the
+            task, or too few samples.
 
     Examples:
         >>> from phihp_torchrl.integrators import make_integrator
@@ -77,8 +95,7 @@ def identify(
     """
     begun = time.perf_counter()
     config = config or IdentifyConfig()
-    if not task.system.has_prior:
-        raise ConfigError("system", f"{type(task.system).__name__} has no prior to fit.")
+    check_system(task.system)
     samples = gather(task.system, recordings)
     if not samples.state.isfinite().any():
         raise ConfigError("recordings", "expected measured states, got NaN alone.")

@@ -1,4 +1,4 @@
-"""Which column of a log holds which state or command, and how its numbers become SI units."""
+"""Which column of a log holds which state, command or input, and how it becomes SI units."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from phihp_torchrl.recordings.units import factor_of
 from phihp_torchrl.systems import System
 
 RESERVED = ("time", "episode")
-"""Names besides those of states and actions: the time stamps and the number of the episode."""
+"""Names besides those of the system: the time stamps and the number of the episode."""
 
 _DEGREES = 100.0  # an angle without a unit that ranges over more within one turn is in degrees
 
@@ -101,7 +101,8 @@ def read_columns(system: System, columns: Mapping[str, Any]) -> dict[str, Column
     Names that are not in the setting have the column of their own name.
 
     Args:
-        system: the system, whose states and actions may be named, beside ``time`` and ``episode``.
+        system: the system, whose states, actions and inputs may be named, beside ``time`` and
+            ``episode``.
         columns: the setting.
 
     Returns:
@@ -111,7 +112,7 @@ def read_columns(system: System, columns: Mapping[str, Any]) -> dict[str, Column
         ConfigError: for a name that the system does not have, and a wrong field of a column; the
             message names it.
     """
-    names = (*RESERVED, *system.state_names, *system.action_names)
+    names = (*RESERVED, *system.state_names, *system.action_names, *system.input_names)
     found: dict[str, Column] = {}
     for name, given in columns.items():
         key = f"columns.{name}"
@@ -155,7 +156,7 @@ def choose_columns(
     """
     known = {**_of_observations(system, table), **given}
     chosen: dict[str, Column] = {}
-    for name in (*RESERVED, *system.state_names, *system.action_names):
+    for name in (*RESERVED, *system.state_names, *system.action_names, *system.input_names):
         column = known.get(name, Column(name))
         missing = [each for each in column.names if each not in table.columns]
         if not missing:

@@ -39,10 +39,10 @@ class RecordedData:
     Args:
         recordings: the uninterrupted stretches, in the order of the files.
         counts: ``rows`` that were read and ``samples`` that are used, and how often a row had a
-            ``missing_time`` or ``missing_command``, missed a measured state (``missing_state``),
-            had the time of the row before (``repeated_time``) or an earlier one (``time_back``),
-            came after a gap (``lost``), had too few or too many cells (``ragged``) or an
-            ``infinite`` value, or was left ``alone`` between two cuts.
+            ``missing_time``, ``missing_command`` or ``missing_input``, missed a measured state
+            (``missing_state``), had the time of the row before (``repeated_time``) or an earlier
+            one (``time_back``), came after a gap (``lost``), had too few or too many cells
+            (``ragged``) or an ``infinite`` value, or was left ``alone`` between two cuts.
         notes: a sentence for each of these and each file, with file, line and column.
 
     Examples:
@@ -75,19 +75,20 @@ def read_recordings(
     """Read recorded episodes from files, in the units of a system.
 
     A row without a time is left out. Where it was, where the clock says that rows are lost, and
-    after a row without a command, a recording ends and a new one begins, so that nothing is ever
-    bridged. A row that misses a measured state is kept, with NaN there. Infinite values count as
-    missing. An angle whose values jump by a turn is continued over the jump within a recording.
-    Everything of that kind is counted and logged. A text that is no number is an error.
+    after a row without a command or an input, a recording ends and a new one begins, so that
+    nothing is ever bridged. A row that misses a measured state is kept, with NaN there. Infinite
+    values count as missing. An angle whose values jump by a turn is continued over the jump within
+    a recording. Everything of that kind is counted and logged. A text that is no number is an
+    error.
 
     Args:
         task: the task, or the system alone.
         files: files, patterns (``logs/*.csv``), folders, or ``minari:`` and the name or path of a
             data set: CSV, Parquet (``.parquet``), HDF5 (``.h5``) and Minari. Each file begins a new
             episode.
-        columns: for each state and action, and for ``time`` and ``episode``, the name of its column
-            or the fields of a :class:`Column`. What is not named has the column of its own name. A
-            velocity without a column is not measured; it is NaN in all samples.
+        columns: for each state, action and input, and for ``time`` and ``episode``, the name of its
+            column or the fields of a :class:`Column`. What is not named has the column of its own
+            name. A velocity without a column is not measured; it is NaN in all samples.
         time_step: seconds between rows, where there are no time stamps.
         gap: how many times the median an interval must be to mean that rows are lost, where the
             clock is about regular otherwise.
@@ -146,7 +147,8 @@ def read_recordings(
 def _needed(system: System, given: Mapping[str, Column], time_step: float | None) -> list[str]:
     """Columns without which a group of a file is no episode."""
     optional = {"episode", *system.velocity_of.values()}
-    names = [*system.state_names, *system.action_names, *(["time"] if time_step is None else [])]
+    names = [*system.state_names, *system.action_names, *system.input_names]
+    names += ["time"] if time_step is None else []
     kept = {name: Column(name) for name in names if name not in optional} | dict(given)
     return [each for column in kept.values() for each in column.names]
 
@@ -184,6 +186,7 @@ def _samples(
     unmeasured = [name for name in system.state_names if name not in chosen]
     for name in unmeasured:
         values[name] = np.full(count, np.nan)
+    inputs = [values[name] for name in system.input_names]
     time = values["time"] if time_step is None else time_step * np.arange(count)
     if time_step is not None and len(table.ragged):
         time[np.array(table.ragged)] = np.nan
@@ -191,6 +194,7 @@ def _samples(
         time=time,
         state=np.stack([values[name] for name in system.state_names], -1),
         action=np.stack([values[name] for name in system.action_names], -1),
+        inputs=np.array(inputs).reshape(len(inputs), count).T,  # without any, zero columns
         labels=table.labels(chosen["episode"].names[0]) if "episode" in chosen else None,
         wrapped=[i for i in system.angle_indices if _wraps(values[system.state_names[i]])],
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,7 @@ class Samples:
         time: seconds, ``[rows]``; NaN where it is missing.
         state: ``[rows, n]``; NaN where a component is missing.
         action: ``[rows, m]``; NaN where a command is missing.
+        inputs: ``[rows, k]``; NaN where an input is missing.
         labels: what tells episodes apart, ``[rows]``, or ``None``.
         wrapped: indices of the angles whose values jump by a turn.
     """
@@ -56,6 +58,7 @@ class Samples:
     time: NDArray[Any]
     state: NDArray[Any]
     action: NDArray[Any]
+    inputs: NDArray[Any]
     labels: Sequence[Any] | None
     wrapped: Sequence[int]
 
@@ -63,7 +66,7 @@ class Samples:
 def cut(
     samples: Samples, table: Table, report: Report, *, episode: int, gap: float
 ) -> list[Recording]:
-    """Cut samples where an episode, the clock, the commands or the rows are interrupted.
+    """Cut samples where an episode, the clock, commands, inputs or the rows are interrupted.
 
     Args:
         samples: the rows.
@@ -105,9 +108,12 @@ def cut(
         table,
         f"intervals over {gap:g} medians, where rows are lost; cut there.",
     )
-    # A command that is missing is not known to hold until the next row, whose state is still good.
-    silent = ~np.isfinite(samples.action).all(-1)[rows]
-    report.add("missing_command", rows[silent], table, "rows without a command; cut there.")
+    # What acts is not known until the next row, but the state of a row without it is still good.
+    no_command = ~np.isfinite(samples.action).all(-1)[rows]
+    report.add("missing_command", rows[no_command], table, "rows without a command; cut there.")
+    no_input = ~np.isfinite(samples.inputs).all(-1)[rows]
+    report.add("missing_input", rows[no_input], table, "rows without an input; cut there.")
+    silent = no_command | no_input
     after_silent = np.concatenate([[False], silent[:-1]]) if len(rows) else silent
     absent = ~np.isfinite(samples.state)[rows]
     partly = (absent & ~absent.all(0)).any(-1)  # of components that are measured at all
@@ -179,14 +185,16 @@ def _recordings(
 ) -> list[Recording]:
     starts = np.flatnonzero(ends)
     found = []
-    for start, stop in zip(starts, [*starts[1:], len(rows)], strict=True):
+    for start, stop in pairwise([*starts, len(rows)]):
         part = rows[start:stop]
         if len(part) < 2:
             report.add("alone", part, table, "row between two cuts, with no row to go with it.")
             continue
-        action = samples.action[part].copy()
-        if not np.isfinite(action[-1]).all():
-            action[-1] = action[-2]  # the last command is never used
+        # The last command is never used, and the last known input is taken to stay.
+        action, inputs = samples.action[part].copy(), samples.inputs[part].copy()
+        for values in (action, inputs):
+            if not np.isfinite(values[-1]).all():
+                values[-1] = values[-2]
         state = samples.state[part].copy()
         for i in samples.wrapped:
             known = np.isfinite(state[:, i])
@@ -199,6 +207,7 @@ def _recordings(
                 torch.from_numpy(action),
                 source=table.place(int(part[0])),
                 episode=int(numbers[start]),
+                inputs=torch.from_numpy(inputs),
             )
         )
     return found

@@ -26,6 +26,8 @@ def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
     A transition is left out, and counted in the log, where a state is unknown before or after it,
     and where its command is beyond the bounds or the rate of the task, which a model would clip.
     The physics know of no reference: where the task has one, it stands in the middle of its range.
+    Inputs are those of the recording; a preview has the samples that follow in the same recording,
+    of which the last one is taken to stay.
 
     Args:
         task: the task, which says what was earned and where an episode ends.
@@ -37,8 +39,8 @@ def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
         ``[N, 1]``, float32, in order. ``"done"`` marks the last transition before an interruption.
 
     Raises:
-        ConfigError: for recordings of another system, a state that was never measured, a task with
-            inputs, which recordings do not have, and if nothing is left.
+        ConfigError: for recordings of another system or without its inputs, a state that was never
+            measured, and if nothing is left.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -66,7 +68,7 @@ def _states(task: Task, recording: Recording) -> Tensor:
     """The task's state at each sample, float64 ``[T, n]``.
 
     This is the only place where a sample of a log becomes a state: what a task adds to the physical
-    one, from the commands so far, belongs here.
+    one, from the commands so far and the measured inputs, belongs here.
     """
     if not task.register_count:
         return recording.state
@@ -74,17 +76,17 @@ def _states(task: Task, recording: Recording) -> Tensor:
     commands = task.clip_action(recording.action)
     rest = task.clip_action(torch.zeros_like(commands[0]))
     _, registers = task.registers.along(commands, held, rest)
+    if task.inputs is not None:
+        last = len(recording) - 1
+        known = torch.arange(last + 1)[:, None] + torch.arange(task.inputs.rows)
+        given = {"inputs": recording.inputs[known.clamp_max(last)]}  # [T, rows, k]
+        own = task.outside.read(given, registers[:, : task.outside.size])
+        registers = task.outside.replaced(registers, own)
     return torch.cat([recording.state, registers], -1)
 
 
 def _check(task: Task, recordings: Sequence[Recording]) -> None:
     names = task.system.state_names
-    if task.inputs is not None:
-        raise ConfigError(
-            "recordings",
-            f"task {task.name!r} has inputs {task.inputs.names}, which a recording does not have; "
-            "learn its model from recordings by a task without.",
-        )
     check_columns(task.system, recordings)
     measured = torch.stack([log.measured for log in recordings]).any(0) if recordings else ()
     if missing := [n for n, known in zip(names, measured, strict=False) if not known]:

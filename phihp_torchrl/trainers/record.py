@@ -21,9 +21,9 @@ _log = logging.getLogger(__name__)
 def record(world: World, config: CollectConfig, steps: int, seed: int, path: Path) -> Path:
     """Take real steps with the exploration of phase 1, and write them to a CSV file as they come.
 
-    The file has the columns ``time``, ``episode`` and one for each state and action of the task's
-    system, so that ``world=recorded world.files=...`` reads it without further words. The last row
-    of an episode repeats the command before, which nothing follows.
+    The file has the columns ``time``, ``episode`` and one for each state, action and input of the
+    task's system, so that ``world=recorded world.files=...`` reads it without further words. The
+    last row of an episode repeats the command before, which nothing follows.
 
     Args:
         world: a world in which one can act.
@@ -60,11 +60,14 @@ def record(world: World, config: CollectConfig, steps: int, seed: int, path: Pat
     writing = path.open("w", newline="", encoding="utf-8")
     with torch.no_grad(), names_file(path), writing as file:
         table = csv.writer(file)
-        table.writerow(["time", "episode", *task.system.state_names, *task.system.action_names])
+        system = task.system
+        names = (*system.state_names, *system.action_names, *system.input_names)
+        table.writerow(["time", "episode", *names])
 
         def write(place: int, observation: Tensor, action: Tensor) -> None:
-            state, _ = task.split(task.locate(observation))
-            numbers = [*state.tolist(), *action.tolist()]
+            state, registers = task.split(task.locate(observation))
+            inputs = task.outside.values(registers).get("inputs", registers[:0])
+            numbers = [*state.tolist(), *action.tolist(), *inputs.tolist()]
             known = [f"{v:.9g}" if abs(v) < float("inf") else "" for v in numbers]
             table.writerow([f"{place * task.time_step:.9g}", episode, *known])
 

@@ -28,8 +28,9 @@ class RecordedConfig:
 
     Args:
         files: a file, pattern or folder, or a list of them; minari:<name> for a Minari data set.
-        columns: the column of each state, action, time and episode, as a name or with column, unit,
-            scale, offset; those in the task's own settings, under columns, come first.
+        columns: the column of each state, action, input, time and episode, as a name or with
+            column, unit, scale, offset; those in the task's own settings, under columns, come
+            first.
         time_step: seconds between rows, where files have no time stamps.
         gap: an interval longer than this many medians means that rows are lost.
         decimal: the sign before decimals in text, a point or a comma.

@@ -16,6 +16,7 @@ from phihp_torchrl.identification.parts import IDENTIFIED, HorizonError, StateEr
 from phihp_torchrl.integrators import make_integrator
 from phihp_torchrl.recordings import Recording
 from phihp_torchrl.tasks import Actuator
+from tests import followed
 from tests.identification.rigs import MASS, ROD, Mass, Rod, make_task, record
 
 UNSEEN = math.nan
@@ -229,6 +230,12 @@ def test_recordings_that_do_not_fit_are_refused() -> None:
     log = record(Mass(), MASS, samples=40)
     with pytest.raises(ConfigError, match="unknown state"):
         identify(task, [log], IdentifyConfig(stops={"y": (0.0, 1.0)}))
+
+
+def test_inputs_are_refused_before_any_fit() -> None:
+    log = Recording(torch.arange(9), torch.zeros(9, 2), torch.zeros(9, 1), inputs=torch.ones(9, 1))
+    with pytest.raises(ConfigError, match=r"inputs: Mass has inputs \('wind',\), which"):
+        identify(followed.followed(followed.Mass()), [log])
 
 
 def by_eulers_steps(samples: int, step: float, delay: int = 0, noise: float = 0.0) -> Recording:

@@ -23,6 +23,12 @@ class Tank(System):
     state_names, action_names = ("level",), ("pump",)
 
 
+class OpenTank(Tank):
+    """It rains into it."""
+
+    input_names = ("rain",)
+
+
 def samples(count: int = 12, seed: int = 0) -> dict[str, np.ndarray]:
     draw = np.random.default_rng(seed)
     values = {name: draw.normal(size=count) for name in (*Rig.state_names, "force")}

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.recordings import Column, read_recordings
 from phihp_torchrl.recordings.units import UNITS
-from tests.recordings.log_parts import Rig, samples, write_csv
+from tests.recordings.log_parts import OpenTank, Rig, Tank, samples, write_csv
 
 NUMBERS = st.floats(-1e6, 1e6)
 
@@ -110,3 +110,24 @@ def test_a_state_an_action_and_a_clock_must_be_there_and_a_velocity_need_not(
     columns = {k: v for k, v in samples().items() if k != "x_dot"}
     data = read_recordings(Rig(), write_csv(tmp_path / "log.csv", columns))
     assert data.recordings[0].measured.tolist() == [True, True, False, True]
+
+
+def test_an_input_has_a_column_as_a_command_has(tmp_path: Path) -> None:
+    columns = {"time": [0.0, 1.0], "level": [0.1, 0.2], "pump": [1.0, 1.0], "mm": [4.0, 6.0]}
+    log = write_csv(tmp_path / "tank.csv", columns)
+    rain = {"rain": {"column": "mm", "unit": "mm"}}
+    found = read_recordings(OpenTank(), log, rain).recordings[0].inputs
+    assert found.tolist() == [[0.004], [0.006]]
+    with pytest.raises(ConfigError, match=r"columns.rain: .*tank.csv has no column 'rain'"):
+        read_recordings(OpenTank(), log)
+    with pytest.raises(ConfigError, match=r"columns.rain: expected one of"):
+        read_recordings(Tank(), log, rain)
+    assert read_recordings(Tank(), log).recordings[0].inputs.shape == (2, 0)
+
+
+def test_a_file_without_rows_is_told(tmp_path: Path) -> None:
+    log = tmp_path / "tank.csv"
+    log.write_text("time,level,pump,rain\n")
+    for system in (OpenTank(), Tank()):
+        with pytest.raises(ConfigError, match="no two consecutive rows"):
+            read_recordings(system, log)

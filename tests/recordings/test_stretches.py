@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.recordings import RecordedData, read_recordings
-from tests.recordings.log_parts import Rig, Tank, samples, write_csv
+from tests.recordings.log_parts import OpenTank, Rig, Tank, samples, write_csv
 
 
 def tank(path: Path, **columns: list[object]) -> RecordedData:
@@ -42,6 +42,22 @@ def test_a_missing_time_and_a_missing_command_end_a_recording(tmp_path: Path) ->
     assert data.recordings[0].action[:, 0].tolist() == [1.0, 1.0, 1.0]
     assert data.counts["missing_command"] == 1
     assert "tank.csv, line 4: 1 rows without a command" in " ".join(data.notes)
+
+
+def test_a_missing_input_ends_a_recording_as_a_missing_command_does(tmp_path: Path) -> None:
+    columns = {
+        "time": range(7),
+        "level": [0.1 * k for k in range(7)],
+        "pump": [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, "nan"],
+        "rain": [0.0, 1.0, "", 3.0, 4.0, 5.0, "inf"],
+    }
+    data = read_recordings(OpenTank(), write_csv(tmp_path / "tank.csv", columns))
+    # The state of the row without an input is where those before it have led to.
+    assert times(data) == [[0.0, 1.0, 2.0], [3.0, 4.0, 5.0, 6.0]]
+    # The last one is taken to stay.
+    assert [r.inputs[:, 0].tolist() for r in data.recordings] == [[0, 1, 1], [3, 4, 5, 5]]
+    assert (data.counts["missing_input"], data.counts["missing_command"]) == (2, 1)
+    assert "tank.csv, line 4: 2 rows without an input; cut there." in " ".join(data.notes)
 
 
 def test_a_missing_state_is_kept_and_an_infinite_one_is_missing(tmp_path: Path) -> None:

@@ -8,9 +8,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from phihp_torchrl import Actuator, Signal, get_task
+from phihp_torchrl import Actuator, Signal, Task, get_task
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.recordings import Recording, transitions
+from phihp_torchrl.worlds import SimulatedWorld
 from tests.followed import WIND, Mass, followed
 
 PENDULUM = get_task("pendulum")
@@ -114,6 +115,68 @@ def test_a_reference_stands_in_the_middle_of_its_range() -> None:
     )
 
 
-def test_inputs_that_no_recording_has_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"has inputs \('wind',\), which a recording does not"):
-        transitions(followed(Mass(), inputs=WIND), [recording()])
+def registers(task: Task, observation: torch.Tensor) -> dict[str, torch.Tensor]:
+    return task.outside.split(task.split(task.locate(observation))[1])
+
+
+def test_inputs_are_those_of_the_recording_and_act_until_the_next_sample() -> None:
+    task, wind = followed(Mass()), torch.linspace(-2.0, 2.0, 6)[:, None]
+    data = transitions(task, [recording(inputs=wind)])
+    assert torch.allclose(registers(task, data["observation"])["inputs"], wind[:-1])
+    assert torch.allclose(registers(task, data["next", "observation"])["inputs"], wind[1:])
+    assert not registers(task, data["observation"])["reference"].any()  # the middle of its range
+    acting, _ = task.acting(task.split(task.locate(data["observation"]))[1], data["action"])
+    assert torch.allclose(acting, torch.cat([data["action"], wind[:-1]], -1))
+
+
+def test_a_preview_ends_with_its_recording() -> None:
+    task, wind = followed(Mass(), inputs=replace(WIND, preview=2)), torch.arange(4.0)[:, None] / 2
+    data = transitions(task, [recording(4, inputs=wind), recording(4, inputs=-wind)])
+    known = torch.tensor([[0.0, 0.5, 1.0], [0.5, 1.0, 1.5], [1.0, 1.5, 1.5]])
+    after = torch.tensor([[0.5, 1.0, 1.5], [1.0, 1.5, 1.5], [1.5, 1.5, 1.5]])
+    seen = registers(task, data["observation"])["inputs"]
+    assert torch.allclose(seen, torch.cat([known, -known]))
+    seen = registers(task, data["next", "observation"])["inputs"]
+    assert torch.allclose(seen, torch.cat([after, -after]))
+
+
+def test_inputs_stand_before_what_is_under_way() -> None:
+    task = followed(Mass(), actuator=Actuator(delay_steps=1.0))
+    log = recording(inputs=torch.rand(6, 1))
+    state = task.locate(transitions(task, [log])["observation"])
+    assert torch.allclose(state[:, 2], log.inputs[:-1, 0].float())
+    assert torch.allclose(state[1:, -1], log.action[:-2, 0].float())
+
+
+def test_they_are_laid_out_as_those_of_a_world() -> None:
+    task = followed(Mass(), inputs=replace(WIND, preview=1))
+    torch.manual_seed(0)
+    env = SimulatedWorld(task).make_env()
+    steps = env.rollout(10)
+    state = task.locate(torch.cat([steps["observation"], steps["next", "observation"][-1:]]))
+    wind = task.outside.values(task.split(state)[1])["inputs"]
+    action = torch.cat([steps["action"], steps["action"][-1:]])
+    log = Recording(task.time_step * torch.arange(11), state[:, :2], action, inputs=wind)
+    data = transitions(task, [log])
+    own = task.locate(data["observation"])
+    assert torch.allclose(own[:, :4], state[:-1, :4], atol=1e-5)  # the rest is the reference
+
+
+def test_recordings_without_the_inputs_of_a_system_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"each of the inputs \('wind',\) of Mass, got 0"):
+        transitions(followed(Mass()), [recording()])
+    with pytest.raises(ConfigError, match=r"each of the inputs \(\) of Pendulum, got 1"):
+        transitions(PENDULUM, [recording(inputs=torch.zeros(6, 1))])
+
+
+def test_inputs_of_a_recording_are_finite_and_as_many_as_its_samples() -> None:
+    with pytest.raises(ConfigError, match=r"inputs: .* expected finite inputs"):
+        recording(inputs=torch.full((6, 1), torch.nan))
+    for wrong in (torch.zeros(5, 1), torch.zeros(6), torch.zeros(0, 1)):
+        with pytest.raises(ConfigError, match=r"inputs: .* expected shape \[6, ...\]"):
+            recording(inputs=wrong)
+    none = recording()
+    assert none.inputs.shape == (6, 0)
+    assert none.inputs.dtype == torch.float64
+    shorter = replace(none, time=none.time[:4], state=none.state[:4], action=none.action[:4])
+    assert shorter.inputs.shape == (4, 0)

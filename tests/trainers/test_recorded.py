@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -16,10 +17,18 @@ from phihp_torchrl import HybridDynamics, Signal, load_agent
 from phihp_torchrl.config import METHODS, ConfigError
 from phihp_torchrl.dynamics import FitConfig
 from phihp_torchrl.recordings import Recording
-from phihp_torchrl.trainers import ModelTrainer, RunConfig, read_result, run
+from phihp_torchrl.trainers import (
+    CollectConfig,
+    ModelTrainer,
+    RunConfig,
+    read_result,
+    record,
+    run,
+)
 from phihp_torchrl.trainers.checkpoints import load_state
 from phihp_torchrl.trainers.phases import PHASES, unknown_phases
-from phihp_torchrl.worlds import RecordedWorld, SimulatedWorld
+from phihp_torchrl.worlds import RecordedWorld, SimulatedWorld, make_world
+from tests.followed import WIND, Mass, followed
 
 from .run_parts import CONFIG, Crash, assert_equal, rows
 from .trainer_parts import MODEL, PENDULUM, SHORT, assert_same_state
@@ -83,6 +92,66 @@ def test_an_agent_that_follows_a_reference_is_learned_from_recordings(tmp_path: 
     agent = load_agent(tmp_path / "run" / "agent", task=task)
     given = TensorDict(observation=torch.tensor([1.0, 0.0, 0.0]), reference=torch.tensor([0.5]))
     assert agent(given)["action"].isfinite().all()
+
+
+def in_the_wind(mass: float, *, seen: float = 1.0, count: int = 600) -> RecordedWorld:
+    """Recordings of a mass in the wind, of which ``seen`` times the truth was written down."""
+    task, generator = followed(Mass()), torch.Generator().manual_seed(0)
+    truth = HybridDynamics.pure_prior(task, constants={"mass": mass}, integrator="rk4").double()
+    logs = []
+    for episode in range(2):
+        forces = 4.0 * torch.rand(count, 1, generator=generator).double() - 2.0
+        wind = WIND.draw([], count, task.time_step, generator).double()
+        forces -= 0.5 * wind  # as somebody commands who acts against it
+        state, states = torch.zeros(2).double(), []
+        for acting in torch.cat([forces, wind], -1):
+            states.append(state)
+            with torch.no_grad():
+                state = truth(state, acting)
+        time = task.time_step * torch.arange(count)
+        log = Recording(time, torch.stack(states), forces, episode=episode, inputs=seen * wind)
+        logs.append(log)
+    return RecordedWorld(task, logs)
+
+
+@pytest.mark.parametrize("seen", [1.0, 0.0])
+def test_a_model_reckons_with_the_recorded_inputs(seen: float) -> None:
+    fit = FitConfig(steps=20)
+    config = replace(MODEL, kind="prior", integrator="rk4", actuator="none", fit=fit)
+    world = in_the_wind(mass=1.3, seen=seen)
+    trainer = ModelTrainer(world.task, config, seed=0, world=world)
+    metrics = trainer.advance()
+    assert trainer.done
+    found = metrics["constants/mass"]
+    if seen:
+        assert found == pytest.approx(1.3, rel=0.01)
+    else:  # half of the force seems to have done nothing
+        assert found > 1.5 * 1.3
+
+
+def test_an_agent_with_inputs_is_learned_from_recordings(tmp_path: Path) -> None:
+    log = in_the_wind(mass=1.3, count=150).recordings[0]
+    columns = torch.cat([log.time[:, None], log.state, log.action, log.inputs], -1)
+    names = "time,x,x_dot,force,anemometer"
+    np.savetxt(tmp_path / "log.csv", columns, delimiter=",", header=names, comments="")
+    settings = {"files": str(tmp_path / "log.csv"), "columns": {"wind": "anemometer"}}
+    world = make_world(followed(Mass()), {"kind": "recorded", **settings})
+    assert torch.allclose(world.recordings[0].inputs, log.inputs)
+    run(replace(CONFIG, task="followed"), tmp_path / "run", world=world)
+    agent = load_agent(tmp_path / "run" / "agent", task=world.task)
+    given = {"reference": torch.tensor([0.5]), "inputs": torch.tensor([1.0])}
+    chosen = agent(TensorDict(observation=torch.zeros(2), **given))
+    assert chosen["action"].isfinite().all()
+
+
+def test_steps_that_were_recorded_have_their_inputs(tmp_path: Path) -> None:
+    task = followed(Mass(), inputs=WIND)
+    path = record(SimulatedWorld(task), CollectConfig(), 30, 0, tmp_path / "steps.csv")
+    log = make_world(task, {"kind": "recorded", "files": str(path)}).recordings[0]
+    speed, push = log.state[:, 1], (log.action + log.inputs)[:, 0]
+    mass = push[:-1] * log.intervals / speed.diff()
+    assert log.inputs.abs().amax() > 0.1
+    torch.testing.assert_close(mass, torch.ones_like(mass), rtol=1e-2, atol=0)
 
 
 def test_methods_that_act_are_refused(tmp_path: Path) -> None:
