@@ -97,6 +97,11 @@ class ILQR(Controller):
         self.register_buffer("_guesses", torch.cat([torch.zeros_like(guesses[:1]), guesses]))
         self.reset()
 
+    @property
+    def dynamics(self) -> nn.Module:
+        """The model that it was made in."""
+        return self.problem.dynamics
+
     @classmethod
     def from_model(cls, task: Task, dynamics: nn.Module, config: ILQRConfig | None = None) -> ILQR:
         """Build it for a task in a model.

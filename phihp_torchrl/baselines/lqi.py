@@ -89,6 +89,11 @@ class LQI(Controller):
         self._places = list(followed(point.task).values())
         self._kept: tuple[Tensor, Tensor] | None = None
 
+    @property
+    def dynamics(self) -> nn.Module | None:
+        """The model that it was made in, if it is known."""
+        return self.point.dynamics
+
     @classmethod
     def from_model(
         cls,

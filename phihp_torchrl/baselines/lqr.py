@@ -57,6 +57,11 @@ class LQR(Controller):
         self.register_buffer("gain", torch.as_tensor(gain))
         self.register_buffer("cost", torch.as_tensor(cost))
 
+    @property
+    def dynamics(self) -> nn.Module | None:
+        """The model that it was made in, if it is known."""
+        return self.point.dynamics
+
     @classmethod
     def from_model(
         cls,

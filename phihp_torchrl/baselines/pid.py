@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,7 @@ from phihp_torchrl.baselines.controller import Controller
 from phihp_torchrl.baselines.point import LinearModel, half_ranges, is_smooth, linearise
 from phihp_torchrl.baselines.reference import followed, middle, present
 from phihp_torchrl.baselines.tuning import Gains, pair, tune
-from phihp_torchrl.config import ConfigError, check_positive
+from phihp_torchrl.config import LARGEST_FLOAT32, ConfigError, plain
 from phihp_torchrl.tasks import Task
 
 
@@ -70,6 +70,11 @@ class PID(Controller):
         self._integral: Tensor | None = None
         self._followed = followed(point.task)
 
+    @property
+    def dynamics(self) -> nn.Module | None:
+        """The model that it was made in, if it is known."""
+        return self.point.dynamics
+
     @classmethod
     def from_model(
         cls,
@@ -99,7 +104,7 @@ class PID(Controller):
                 component.
         """
         if time_constant is not None:
-            check_positive(SimpleNamespace(time_constant=time_constant), "time_constant")
+            time_constant = _positive("time_constant", time_constant)
         follows = list(followed(task))
         if follows and goal is None:
             goal = middle(task)
@@ -153,3 +158,12 @@ class PID(Controller):
         if kept is None or kept.shape != zero.shape or kept.device != zero.device:
             return zero
         return kept if starts is None else torch.where(starts.unsqueeze(-1), zero, kept)
+
+
+def _positive(key: str, value: Any) -> float:
+    """A finite number above 0, also one of NumPy or torch; refuses others by the key."""
+    number = plain(value)
+    known = isinstance(number, (int, float)) and not isinstance(number, bool)
+    if known and 0 < number <= LARGEST_FLOAT32:
+        return number
+    raise ConfigError(key, f"expected a positive number, got {value!r}.")

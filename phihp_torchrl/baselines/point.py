@@ -41,6 +41,7 @@ class LinearModel:
         a: the matrix A, ``[n, n]``.
         b: the matrix B, ``[n, m]``.
         moved: the registers in ``z``, by their places among those of the task.
+        dynamics: the model that was linearised, if it is known.
     """
 
     task: Task
@@ -49,6 +50,7 @@ class LinearModel:
     a: Matrix
     b: Matrix
     moved: tuple[int, ...] = ()
+    dynamics: nn.Module | None = None
 
     def difference(self, state: Tensor, at: Tensor | None = None) -> Tensor:
         """``z`` of a state, in its dtype and on its device.
@@ -147,7 +149,7 @@ def linearise(
         raise ConfigError("dynamics", "expected finite derivatives at the goal, got others.")
     size = len(state)
     kept = [*range(size), *(size + place for place in moved)]
-    return LinearModel(task, at[kept], action, a[np.ix_(kept, kept)], b[kept], moved)
+    return LinearModel(task, at[kept], action, a[np.ix_(kept, kept)], b[kept], moved, dynamics)
 
 
 def _moved(task: Task) -> tuple[int, ...]:

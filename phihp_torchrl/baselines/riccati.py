@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import LinAlgError, solve_discrete_are
 
 from phihp_torchrl.baselines.point import Matrix, half_ranges
 from phihp_torchrl.config import ConfigError
@@ -42,6 +41,8 @@ def solve_regulator(
         ConfigError: where the action cannot stabilise it, naming the component that it does not
             reach, and where the equation has no solution.
     """
+    from scipy.linalg import solve_discrete_are  # which few of those who import us need
+
     if lost := unstabilisable(task, a, b, names):
         actions = ", ".join(task.system.action_names)
         raise ConfigError(
@@ -51,7 +52,7 @@ def solve_regulator(
         )
     try:
         cost = solve_discrete_are(a, b, q, r)
-    except (LinAlgError, ValueError) as error:
+    except (np.linalg.LinAlgError, ValueError) as error:
         raise ConfigError(
             "dynamics", f"expected a Riccati equation with a solution at the goal: {error}"
         ) from error

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 
 from phihp_torchrl.agents import Actor, TwinQ
+from phihp_torchrl.baselines import Controller
 from phihp_torchrl.config import ConfigError, kind_mapping, read_kind, resolve_seconds
 from phihp_torchrl.deployment.under_way import UnderWay
 from phihp_torchrl.deployment.warm_up import WarmUp
@@ -41,7 +42,10 @@ class Agent(TensorDictModuleBase):
     Args:
         task: the task that it was trained for.
         dynamics: the model, which the planner needs.
-        actor: the policy.
+        actor: the policy. One that keeps something from step to step is told by :meth:`reset` that
+            an episode starts, if it is a baseline (:mod:`phihp_torchrl.baselines`) or a class with
+            a method ``reset()`` that has ``"is_init"`` among its ``in_keys``. The ``reset`` of
+            another, and of a network in a ``TensorDictModule``, is not called.
         qvalue: the critics, for the value beyond the planner's horizon.
         planner_config: settings of the planner; ``None`` for an agent without a planner.
         use_planner: whether to plan; ``False`` is the actor alone. See also :meth:`actor_alone`.
@@ -228,13 +232,16 @@ class Agent(TensorDictModuleBase):
     def reset(self) -> None:
         """Drop the previous plan, what is under way and the actor's memory, as an episode starts.
 
-        An actor has a memory if it has a function ``reset()``, as a controller with an integral.
+        Which actors have a memory is said where an agent is given one.
         """
         if self._warm_up is not None and self._warm_up.take():
             self._warm_up = None
-        for part in (self.planner, self._memory, self.actor):
-            if callable(reset := getattr(part, "reset", None)):
-                reset()
+        for part in (self.planner, self._memory):
+            if part is not None:
+                part.reset()
+        actor: Any = self.actor
+        if _has_memory(actor):
+            actor.reset()
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy, or another process, does not wait for what is compiled for this one.
@@ -339,6 +346,15 @@ class Agent(TensorDictModuleBase):
         if observation.device.type == "cpu" and not is_finite(observation):
             raise ValueError("observation: expected finite observations, got some that are not.")
         return observation
+
+
+def _has_memory(actor: Any) -> bool:
+    """Whether an actor's own class has a ``reset()`` for where an episode starts.
+
+    A TensorDictModule has the attributes of its network too, whose ``reset`` may be anything.
+    """
+    reads_starts = "is_init" in getattr(actor, "in_keys", ())
+    return isinstance(actor, Controller) or (reads_starts and hasattr(type(actor), "reset"))
 
 
 def _is_followed(module: Any) -> bool:

@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import chain
 from threading import RLock
 from typing import Any
 
@@ -15,10 +16,11 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from phihp_torchrl.config import ConfigError, is_whole
+from phihp_torchrl.config import ConfigError, is_whole, plain
 from phihp_torchrl.deployment.control_report import ControlReport, Tally
 from phihp_torchrl.deployment.deadline import DeadlineWorker
 from phihp_torchrl.deployment.entries import Entries, as_numbers
+from phihp_torchrl.deployment.estimation import find_model, needs_estimate
 from phihp_torchrl.deployment.fallback import Fallback, FallbackChain
 from phihp_torchrl.deployment.observer import VelocityObserver
 from phihp_torchrl.deployment.own_check import OwnCheck
@@ -59,14 +61,15 @@ class Controller:
         accept: a check of your own, of observation and action; false refuses the action, and so
             does an error that it raises, of which the first is logged.
         dynamics: the model, on the agent's device, by which a disturbance of the task is estimated.
-            Defaults to the agent's; an exported agent has none.
+            Defaults to the agent's, or to that of the baseline that it is or acts by; an exported
+            agent has none. Observations that have the estimate in them need no model.
         observer: completes states whose velocities are not measured; :meth:`step` is then given
             physical states ``[n]`` with NaN for what is not measured.
         clock: a function that returns the time in seconds; timestamps are of this clock.
 
     Raises:
-        ConfigError: for limits or a fallback that do not fit the agent and its task, and for a task
-            with a disturbance where neither the agent nor ``dynamics`` is a model.
+        ConfigError: for limits or a fallback that do not fit the agent and its task, and for an
+            observer where a trained agent needs the estimate of a disturbance and has no model.
 
     Examples:
         >>> from phihp_torchrl import Agent, get_task
@@ -108,17 +111,15 @@ class Controller:
         self._checks = Checks(self.task, self.safety)
         self._chain = FallbackChain(agent, self.task, self._checks, fallback)
         self._entries = Entries(agent, self.task)
-        model = getattr(agent, "dynamics", None) if dynamics is None else dynamics
-        if self.task.disturbance is not None and model is None:
-            raise ConfigError(
-                "dynamics",
-                "expected a model, by which the task's disturbance is estimated, got None, and the "
-                "agent has none (`load_agent(...).dynamics` is the one that it was made with).",
-            )
+        model, self._needs_estimate = None, False
+        if self.task.disturbance is not None:
+            model = find_model(agent) if dynamics is None else dynamics
+            self._needs_estimate = model is None and needs_estimate(agent, self.task, observer)
         self._memory = UnderWay(self.task, model) if self.task.register_count else None
         self._worker = DeadlineWorker()
         self._lock = RLock()
-        like = next(agent.parameters(), torch.empty(0))
+        own = agent.parameters() if model is None else chain(agent.parameters(), model.parameters())
+        like = next(own, torch.empty(0))
         self._like = torch.empty(0, dtype=torch.float32, device=like.device)
         self._cuda = [like.device] if like.is_cuda else []
         self._tally = Tally()
@@ -144,24 +145,30 @@ class Controller:
 
         Args:
             observation: what was measured, ``[o]``: the observation of the system alone, or with
-                what is under way; for a controller with an observer, a state ``[n]``.
+                all that the task adds, which is then taken as it is, the estimate of a disturbance
+                too; one of the two throughout an episode. For a controller with an observer, a
+                state ``[n]``.
             timestamp: when it was measured, in seconds of ``clock``. With ``Safety.max_age`` it is
-                stale where it is older, is not a number, or is more than a time step ahead.
+                stale where it is older, is NaN, or is more than a time step ahead; and always where
+                it is that of the step before.
             inputs: further entries that the agent reads, by key: ``reference`` and ``inputs`` of
                 the task, ``[k]``, or with their preview ``[rows, k]``, in physical units.
 
         Raises:
-            ValueError: for an observation of the wrong size; for a reference or inputs of the task
-                that are missing where an episode starts, or of another shape; for an entry that is
-                no number, and for one that nobody reads.
+            ValueError: for an observation of the wrong size, as one without the estimate that a
+                trained agent needs where there is no model; for a reference or inputs of the task
+                that are missing where an episode starts, or of another shape; for an entry or, with
+                ``Safety.max_age``, a timestamp that is no number; and for an entry that nobody
+                reads.
         """
         with self._lock, torch.no_grad():
             started = self._clock()
+            age = self._age(timestamp, started)
             finite = self._entries.read(inputs)
             lost = len(finite) < len(inputs)
             measured = as_numbers("observation", observation).detach().cpu()
             seen = self._complete(measured, finite.get("inputs"))
-            reason = self._fault(seen, timestamp, started)
+            reason = self._fault(seen, timestamp, age)
             shown = seen if reason is None else torch.full_like(seen, torch.nan)
             data = self._data(shown, finite, lost)
             usable = None if reason else data
@@ -193,6 +200,7 @@ class Controller:
         Raises:
             ConfigError: for ``calls`` that are no whole number.
         """
+        calls = plain(calls)
         if not is_whole(calls, 0):
             raise ConfigError("calls", f"expected a whole number >= 0, got {calls!r}.")
         with self._lock, torch.no_grad(), torch.random.fork_rng(devices=self._cuda):
@@ -221,7 +229,7 @@ class Controller:
 
     @property
     def estimate(self) -> Tensor | None:
-        """The estimate ``[size]`` of the task's disturbance; ``None`` without one."""
+        """Our estimate ``[size]`` of the task's disturbance; ``None`` where we make none."""
         return None if self._memory is None else self._memory.estimate
 
     def report(self) -> ControlReport:
@@ -247,19 +255,34 @@ class Controller:
             sizes = {system.state_dim}
         else:
             sizes = {system.observation_dim, self.task.observation_dim}
+        without = ""
+        if self._needs_estimate:
+            sizes = {self.task.observation_dim}
+            without = ", with the estimate of the disturbance where there is no model (`dynamics`)"
         if measured.ndim != 1 or len(measured) not in sizes:
             raise ValueError(
-                f"observation: expected shape [{' or '.join(map(str, sorted(sizes)))}], "
+                f"observation: expected shape [{' or '.join(map(str, sorted(sizes)))}]{without}, "
                 f"got {list(measured.shape)}."
             )
         if self.observer is None:
             return measured
         return system.observe(self.observer.update(measured, inputs))
 
-    def _fault(self, seen: Tensor, timestamp: float | None, now: float) -> str | None:
+    def _age(self, timestamp: Any, now: float) -> float:
+        """Seconds since a sample was measured; 0 where nobody asks."""
+        if timestamp is None or self.safety.max_age is None:
+            return 0.0
+        try:
+            if isinstance(seconds := plain(timestamp), (str, bytes, bool)):
+                raise TypeError("expected a number")
+            return now - float(seconds)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"timestamp: expected seconds, got {timestamp!r}.") from error
+
+    def _fault(self, seen: Tensor, timestamp: float | None, age: float) -> str | None:
         if timestamp is not None:
             last, self._stamp = self._stamp, timestamp
-            age, limit = now - timestamp, self.safety.max_age
+            limit = self.safety.max_age
             # NaN is not within any limits; by a step, two clocks may differ.
             fresh = limit is None or -self.task.time_step <= age <= limit
             if not fresh or timestamp == last:
@@ -274,6 +297,9 @@ class Controller:
         like, memory = self._like, self._memory
         entries = {key: value.to(like) for key, value in finite.items()}
         data = TensorDict(observation=seen.to(like), **entries)
+        disturbed, size = self.task.disturbance is not None, self.task.observation_dim
+        if disturbed and len(seen) == size:
+            data.set(COMPLETE, torch.ones(1, dtype=torch.bool))  # by the caller
         if memory is not None and not memory.is_asked(data):
             memory = None
         self._remembers = memory is not None
@@ -331,8 +357,13 @@ class Controller:
 def _act(agent: TensorDictModuleBase, data: TensorDict, last: Tensor, unheard: int) -> Tensor:
     """The action, after the agent is told, in its own thread, what was sent since its last one."""
     if data["is_init"].item():
-        if hasattr(agent, "reset"):
+        if _has(agent, "reset"):
             agent.reset()
-    elif unheard and hasattr(agent, "follow"):
+    elif unheard and _has(agent, "follow"):
         agent.follow(last, unheard - 1)
     return agent(data)["action"].detach().cpu()
+
+
+def _has(agent: TensorDictModuleBase, name: str) -> bool:
+    """Whether an agent has a method itself; a TensorDictModule has those of its network too."""
+    return hasattr(type(agent), name)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
@@ -65,16 +67,28 @@ def _expected(signal: Signal) -> str:
 
 
 def as_numbers(key: str, value: Any, expected: str = "numbers") -> Tensor:
-    """A value as a float32 tensor.
+    """A value as a float32 tensor; what float32 cannot hold is infinite in it.
+
+    Arrays may be views in any order, as a reversed one, and of any byte order.
 
     Raises:
-        ValueError: for what is no number and no array of numbers; the message names the key.
+        ValueError: for what is no number and no array of real numbers; the message names the key.
 
     Examples:
         >>> as_numbers("speed", [1, 2])
         tensor([1., 2.])
     """
     try:
+        if isinstance(value, (np.ndarray, np.generic)):
+            value = torch.from_numpy(_native(value))
+        if isinstance(value, Tensor) and value.is_complex():
+            raise TypeError("expected real numbers")
         return torch.as_tensor(value, dtype=torch.float32)
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise ValueError(f"{key}: expected {expected}, got {value!r}.") from error
+
+
+def _native(value: Any) -> NDArray[Any]:
+    """A copy of an array that torch can read, which knows no negative strides or foreign bytes."""
+    array = np.array(value)
+    return array.astype(array.dtype.newbyteorder("="), copy=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError, check_count
+from phihp_torchrl.config import ConfigError, check_count, plain
 from phihp_torchrl.dynamics import HybridDynamics
 from phihp_torchrl.tasks import Task
 
@@ -59,13 +59,14 @@ class VelocityObserver:
     ) -> None:
         if smoothing is None:
             smoothing = _WITHOUT_MODEL if dynamics is None else _WITH_MODEL
+        smoothing = plain(smoothing)
         if not (isinstance(smoothing, (int, float)) and 0.0 <= smoothing < 1.0):
             raise ConfigError("smoothing", f"expected a number in [0, 1), got {smoothing!r}.")
         names, pairs = task.system.state_names, dict(task.system.velocity_of)
         if not pairs:
             raise ConfigError("task", "expected a system with velocities, got one without.")
         self.task, self.dynamics = task, dynamics
-        self.most_missing = most_missing
+        self.most_missing = plain(most_missing)
         check_count(self, "most_missing", least=0)
         self._positions = [names.index(name) for name in pairs]
         self._velocities = [names.index(name) for name in pairs.values()]

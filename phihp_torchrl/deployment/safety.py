@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -12,6 +13,8 @@ from phihp_torchrl.config import INFINITE, ConfigError, check_count, check_field
 from phihp_torchrl.deployment.own_check import OwnCheck
 from phihp_torchrl.tasks import LastAction, Task
 from phihp_torchrl.worlds import read_guards
+
+_log = logging.getLogger(__name__)
 
 REASONS = {
     "observation": "an observation that is not finite",
@@ -38,7 +41,7 @@ class Safety:
 
     Args:
         deadline: seconds from the call of ``step`` within which the agent must have acted; ``None``
-            to wait for it for ever.
+            to wait for it for ever. One of more than a time step is warned of.
         plausible: by name of a state, the largest ``|value|``, or the lowest and the highest value,
             that a sensor can report, in the unit of the state. States without an entry may have any
             finite value, and an infinite limit is none.
@@ -115,6 +118,14 @@ class Checks:
         if safety.constraints and not task.constraints:
             raise ConfigError(
                 "constraints", f"expected a task with constraints, {task.name!r} has none."
+            )
+        if safety.deadline is not None and safety.deadline > task.time_step:
+            _log.warning(
+                "deadline: %g s is more than the time step of task %r, %g s, so a late action may "
+                "hold up the loop; it is in seconds.",
+                safety.deadline,
+                task.name,
+                task.time_step,
             )
         names = task.system.state_names
         self._limited = [names.index(name) for name in limits]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -11,6 +12,8 @@ from phihp_torchrl.config import ConfigError, from_mapping
 from phihp_torchrl.deployment.formats import TaskSignature
 from phihp_torchrl.deployment.reading import AgentError
 from phihp_torchrl.tasks import Actuator, Constraint, Task, get_task
+
+_log = logging.getLogger(__name__)
 
 _RATES = ("action_rate_limit", "action_rate_cost")
 
@@ -46,8 +49,8 @@ def find_task(
     """Return the task that an agent's file is of, with all that it was trained with.
 
     A task that is found by its name has the actuator, the rates and the constraints of the file,
-    which a run may have set otherwise than its task does. One that is given keeps its own, and gets
-    those of the file where it has none.
+    which a run may have set otherwise than its task does; a warning says where the task has others
+    of its own. One that is given keeps its own, and gets those of the file where it has none.
 
     Args:
         path: the file, for messages.
@@ -67,11 +70,21 @@ def find_task(
         trained = _with_additions(task, content)
     except (ValueError, TypeError, AttributeError) as error:
         raise AgentError(f"{path}: {error}") from error
-    if isinstance(wanted, Task):
-        for name in ("actuator", *_RATES, "constraints"):
-            here, there = getattr(task, name), getattr(trained, name)
-            if here not in (None, (), there):
-                raise another_task(path, task, f"its {name} {there}", here)
+    for name in ("actuator", *_RATES, "constraints"):
+        here, there = getattr(task, name), getattr(trained, name)
+        if here in (None, (), there):
+            continue
+        if isinstance(wanted, Task):
+            raise another_task(path, task, f"its {name} {there}", here)
+        _log.warning(
+            "%s: the agent was trained with the %s %s, which is used, and task %r has %s here; "
+            "pass it as task to have it refused.",
+            path,
+            name,
+            there,
+            task.name,
+            here,
+        )
     if (saved := content.get("outside", {})) != (ours := _outside(task)):
         raise another_task(path, task, f"the reference, inputs and disturbance {saved}", ours)
     return task if trained == task else trained

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -105,6 +106,13 @@ def test_a_time_constant_that_is_none_is_refused(seconds: Any) -> None:
     task = task_of(Slider())
     with pytest.raises(ConfigError, match="time_constant: expected a positive number, got"):
         PID.from_model(task, prior_of(task), time_constant=seconds)
+
+
+@pytest.mark.parametrize("one", [np.float32(1), np.int64(1), torch.tensor(1.0), 1])
+def test_a_time_constant_of_numpy_or_torch_is_a_number(one: Any) -> None:
+    task = task_of(Slider())
+    expected = PID.from_model(task, prior_of(task), time_constant=1.0).gains
+    assert PID.from_model(task, prior_of(task), time_constant=one).gains == expected
 
 
 # References.

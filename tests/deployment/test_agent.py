@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
 from lopsided import LOPSIDED
 from spawned import send
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch.nn import Linear
 
 from phihp_torchrl import Agent, CEMPlanner, HybridDynamics, MPPIPlanner, get_task
 from phihp_torchrl.agents import Actor, make_actor
@@ -108,6 +111,35 @@ def test_an_actor_with_a_memory_forgets_it_on_reset(kind):
     assert first != second  # the integral has grown
     agent.reset()
     assert agent(shown.clone())["action"] == first
+
+
+class Counting(TensorDictModuleBase):
+    """An actor that says how many steps it has acted since it was reset."""
+
+    def __init__(self, *keys):
+        super().__init__()
+        self.in_keys, self.out_keys, self.steps = ["observation", *keys], ["action"], 0
+
+    def forward(self, tensordict):
+        self.steps += 1
+        return tensordict.set("action", torch.zeros(1))
+
+    def reset(self):
+        self.steps = 0
+
+
+def test_an_actor_that_reads_where_episodes_start_is_reset_and_no_network_is():
+    task = get_task("pendulum")
+    for actor, steps in ((Counting("is_init"), 0), (Counting(), 1)):
+        agent = Agent(task, actor=actor)
+        agent(TensorDict(observation=torch.tensor([1.0, 0.0, 0.0])))
+        agent.reset()
+        assert actor.steps == steps
+    network = Linear(4, 1)
+    network.reset = Mock()
+    for keys in (["observation"], ["observation", "is_init"]):
+        Agent(task, actor=TensorDictModule(network, keys, ["action"])).reset()
+    network.reset.assert_not_called()
 
 
 def test_an_agent_needs_enough_parts():

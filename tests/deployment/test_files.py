@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import tempfile
 from dataclasses import replace
@@ -244,12 +245,32 @@ def own_task(monkeypatch):
 @pytest.mark.parametrize("wanted", [None, OWN.name])
 @pytest.mark.parametrize("changes", [*({k: v} for k, v in CHANGES.items()), {"constraints": ()}])
 def test_a_task_that_is_found_by_name_has_the_numbers_of_the_training(
-    changes, wanted, own_task, tmp_path
+    changes, wanted, own_task, tmp_path, caplog
 ):
     trained = replace(own_task, **changes)
     save_agent(Agent(trained, actor=Actor(trained, (4,))), tmp_path)
-    assert load_agent(tmp_path, task=wanted).task == trained
+    with caplog.at_level(logging.WARNING):
+        assert load_agent(tmp_path, task=wanted).task == trained
+    (record,) = caplog.records  # what is here gives way, and is not dropped without a word
+    (name,) = changes
+    told = [name, str(getattr(trained, name)), str(getattr(own_task, name))]
+    assert all(each in record.getMessage() for each in told)
+    caplog.clear()
     assert load_agent(tmp_path, task=trained).task is trained
+    assert caplog.records == []
+
+
+def test_numbers_of_the_training_that_the_task_lacks_or_shares_need_no_word(
+    own_task, tmp_path, caplog
+):
+    save_agent(Agent(own_task, actor=Actor(own_task, (4,))), tmp_path / "same")
+    pendulum = get_task("pendulum")
+    trained = replace(pendulum, action_rate_limit=4.0, actuator=Actuator(lag=0.1))
+    save_agent(Agent(trained, actor=Actor(trained, (4,))), tmp_path / "more")
+    with caplog.at_level(logging.WARNING):
+        assert load_agent(tmp_path / "same").task == own_task
+        assert load_agent(tmp_path / "more").task == trained
+    assert caplog.records == []
 
 
 @pytest.mark.parametrize("name", CHANGES)
