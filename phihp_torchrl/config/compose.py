@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import lru_cache
@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from phihp_torchrl.config.choices import choices_of, groups, offered, published_offers
 from phihp_torchrl.config.errors import ConfigError
+from phihp_torchrl.config.methods import METHODS
 from phihp_torchrl.config.typed import flatten
 
 MODULE = "phihp_torchrl.config.settings"
@@ -157,18 +158,53 @@ def _explain(
         known_keys = flatten(composed)
         for key in lines:
             if key not in (*_GROUPS, *known_keys) and not key.startswith(("hydra", "world.")):
-                close = _close(key, known_keys)
-                hint = f"did you mean {close[0]!r}?" if close else "phihp train --cfg job has all."
+                close = " or ".join(map(repr, _close(key, known_keys, _unread(composed))))
+                hint = f"did you mean {close}?" if close else "phihp train --cfg job has all."
                 return ConfigError(key, f"unknown key; {hint}")
     return ConfigError("settings", " ".join(str(error).split()))
 
 
-def _close(key: str, known: Iterable[str]) -> list[str]:
-    """The known key that was meant: of the same last name, in seconds or in steps, or alike."""
-    stem = key.removesuffix("_seconds")
+def _unread(config: Mapping[str, Any]) -> set[str]:
+    """Sections of the settings that the method does not read, as those of other methods."""
+    method = METHODS.get(config.get("method") or "")  # one of a plugin may not be known yet
+    every = {section for other in METHODS.values() for section in other.sections}
+    return every.difference(method.sections) if method else set()
+
+
+def _close(key: str, known: Collection[str], unread: Collection[str]) -> list[str]:
+    """The known keys that may have been meant, those of the same section first.
+
+    Args:
+        key: dotted, and unknown. What it gives in seconds may be known in steps.
+        known: all dotted keys.
+        unread: sections that the method does not read; other sections' keys come before theirs.
+    """
+    section = _section(key)
+    name = key[len(section) :].lstrip(".")
+    stem = name.removesuffix("_seconds")
     last = stem.rpartition(".")[2]
-    same = [name for name in known if name.rpartition(".")[2] == last]
-    return get_close_matches(stem, same, n=1, cutoff=0.0) or get_close_matches(key, known, n=1)
+    here = {k[len(section) :].lstrip("."): k for k in known if _section(k) == section}
+    same = [k for k in here if k.rpartition(".")[2] == last]
+    ending = [k for k in here if k.endswith(f"_{last}")]
+    for names, words, cutoff in (
+        (same, stem, 0),
+        (ending, stem, 0),
+        (here, stem, 0.6),
+        (here, name, 0.6),
+    ):
+        if found := get_close_matches(words, names, n=1, cutoff=cutoff):
+            return [here[found[0]]]
+    elsewhere = [k for k in known if k.rpartition(".")[2] == last]
+    read = [k for k in elsewhere if _section(k) not in unread]
+    few = 1 if section else 3  # which section is meant, nobody knows
+    return get_close_matches(stem, read or elsewhere, n=few, cutoff=0) or get_close_matches(
+        key, known, n=1
+    )
+
+
+def _section(key: str) -> str:
+    """The section of a dotted key; none of one that stands by itself."""
+    return key.partition(".")[0] if "." in key else ""
 
 
 def finish(composed: Any, overrides: Sequence[str]) -> dict[str, Any]:

@@ -102,9 +102,12 @@ def expect(config: RunConfig, path: Path) -> Expected:
 def _unlike(config: RunConfig, amounts: set[str]) -> str:
     """What is unlike the committed runs, in words; the amounts of work are reckoned with."""
     usual = load_config(config.task, method=config.method, preset=config.preset)
+    ours, theirs = _work(config), _work(read_run_config(usual))
+    shared = ours.keys() & theirs.keys()  # a phase that one of them skips is no setting
+    ours, theirs = ({k: v for k, v in of.items() if k in shared} for of in (ours, theirs))
     found = [
         f"{key}={value}"
-        for key, value, _ in differences(_work(config), _work(read_run_config(usual)))
+        for key, value, _ in differences(ours, theirs)
         if key not in {*amounts, "evaluate.episodes"}
     ]
     if not found:

@@ -310,6 +310,21 @@ def composed() -> Any:
             "policy.td3.gamma_seconds: unknown key; did you mean 'policy.td3.gamma'?",
         ),
         ("policy.gamma=0.9", "policy.gamma: unknown key; did you mean 'policy.td3.gamma'?"),
+        ("evaluate.seed=3", "evaluate.seed: unknown key; did you mean 'evaluate.first_seed'?"),
+        (
+            "planner.horizon_seconds=1",
+            "planner.horizon_seconds: unknown key; did you mean 'planner.planning_horizon'?",
+        ),
+        (
+            "gamma_seconds=2",  # of no section, and of none that another method reads
+            "gamma_seconds: unknown key; did you mean 'planner.gamma' or 'policy.td3.gamma'?",
+        ),
+        (
+            "policy.mx_seconds=1",
+            "policy.mx_seconds: unknown key; did you mean 'policy.max_seconds'?",
+        ),
+        ("policy.seed=3", "policy.seed: unknown key; did you mean 'seed'?"),
+        ("encoder_dim=3", "encoder_dim: unknown key; did you mean 'tdmpc.learn.told.encoder_dim'?"),
         ("qqqqqq.z=3", "qqqqqq.z: unknown key;"),
         ("task=nonsense", "task: expected one of ['acrobot', "),
         ("preset=nonsense", "preset: expected one of ['default', 'paper'], got 'nonsense'."),

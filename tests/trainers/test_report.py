@@ -184,6 +184,10 @@ def test_settings_unlike_those_that_were_measured_are_named(tmp_path: Path) -> N
     for same in (words(), words(*amounts), words(method="td3")):
         assert "by committed runs of it" in same
         assert "unlike" not in same
+    for fewer in ("phases=[model]", "calibrate.enabled=false"):
+        assert "unlike" not in words(fewer)
+    some = words("phases=[model]", "model.ensemble=5", "policy.method=analytic")
+    assert "unlike them here: model.ensemble=5. The" in some
     two = words("policy.method=analytic", "model.ensemble=5")
     assert "unlike them here: model.ensemble=5, policy.method=analytic. The time left" in two
     many = words(

@@ -15,8 +15,9 @@ from typing import Any
 
 import yaml
 
-from grid.cell import CellFiles
+from grid.cell import Cell, CellFiles
 from grid.claim import claim
+from grid.planned import read_cells
 from measures import configuration_hash, curve_from_metrics, prediction_errors, write_curve
 from phihp_torchrl.deployment import Agent, load_agent
 from phihp_torchrl.evaluation import PROOF_SEED
@@ -70,17 +71,20 @@ def keep_names(cells: Sequence[CellFiles]) -> None:
     """Add the cells that a grid was asked for to ``planned.json``, by their names.
 
     With it a report can say how many of the planned cells there are, and which are missing.
+
+    Raises:
+        ConfigError: for an earlier ``planned.json`` that cannot be read.
     """
-    named = defaultdict[tuple[Path, Path], dict[str, Any]](dict)
+    named = defaultdict[tuple[Path, Path], dict[str, Cell]](dict)
     for files in cells:
-        named[files.planned, files.runs][files.cell.name] = asdict(files.cell)
+        named[files.planned, files.runs][files.cell.name] = files.cell
     for (planned, runs), asked in named.items():
         with claim(runs / f"{planned.name}.lock", wait=60.0):
-            before = json.loads(planned.read_text()) if planned.is_file() else {}
+            before = read_cells(planned, "results")
             if asked.keys() <= before.keys():
                 continue
             planned.parent.mkdir(parents=True, exist_ok=True)
-            every = dict(sorted({**before, **asked}.items()))
+            every = {name: asdict(one) for name, one in sorted({**before, **asked}.items())}
             write_atomically(planned, json.dumps(every, indent=2) + "\n")
 
 

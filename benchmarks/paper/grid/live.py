@@ -47,9 +47,9 @@ class LiveTable(Callback):
             self._cells = swept_cells(base, [*params, *hydra["overrides"]["task"]], root)
             if not base["allow_dirty"]:
                 check_committed()
+            keep_names(self._cells)
         except ConfigError as error:
             sys.exit(f"error: {error}")
-        keep_names(self._cells)
         if base["refresh"]:
             self._thread = threading.Thread(target=self._watch, args=(base["refresh"],))
             self._thread.daemon = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import NamedTuple
@@ -46,7 +46,8 @@ FEWER = 5.0
 LEVEL = 0.05
 """Below this p-value, adjusted by Holm, a difference counts as significant."""
 
-SHOWN, NOT_SHOWN, REFUTED, NOT_RUN = "shown", "not shown", "refuted", "not run"
+SHOWN, NOT_SHOWN, REFUTED = "shown", "not shown", "refuted"
+NOT_RUN, NOT_MEASURED = "not run", "not measured"
 
 _PAIRS = ((TD3_IM_PH, TD3_IM_DD), (PH_CEM, DD_CEM), (PH_TD_MPC_STAR, TD_MPC_STAR))
 
@@ -57,9 +58,10 @@ class _Pair(NamedTuple):
     Attributes:
         what: its name.
         task: whose returns they are.
-        gap: the difference; ``None`` where a side has no run.
+        gap: the difference; ``None`` where a side has no run, or none that says it.
         seeds: of either side, as a finding has them.
         planned: whether grids were asked for both sides.
+        absent: the verdict where there is no difference.
     """
 
     what: str
@@ -67,6 +69,7 @@ class _Pair(NamedTuple):
     gap: Difference | None
     seeds: str
     planned: bool
+    absent: str = NOT_RUN
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,8 @@ class Finding:
         what: the task, or the systems and the task.
         verdict: :data:`SHOWN`, :data:`NOT_SHOWN` or :data:`REFUTED`, or
             :data:`~report.cells.MIXED` where runs are compared that cannot be, or :data:`NOT_RUN`
-            where a side was planned and has no run.
+            where a side was planned and has no run, or :data:`NOT_MEASURED` where both have runs
+            and those of a side do not say what is compared.
         effect: its size, in words.
         ends: what the effect lies between, where it is known by its ends alone.
         interval: its 95 % interval over training seeds.
@@ -103,7 +107,11 @@ def claims_section(results: Results) -> Section:
         "The hybrid model beats the data-driven one at equal samples": _higher(results, _PAIRS),
         "PhIHP acts faster than TD-MPC": faster(results),
     }
-    lines = [f"- **{claim}**: {sentence(findings)}" for claim, findings in claims.items()]
+    sides = (((PHIHP, TD_MPC),), ((PHIHP, TD3),), ((PHIHP,),), _PAIRS, ((PHIHP, TD_MPC),))
+    lines = [
+        f"- **{claim}**: {sentence(findings, done=_any_done(results, systems))}"
+        for (claim, findings), systems in zip(claims.items(), sides, strict=True)
+    ]
     if published := _published_samples(results):
         lines.append(f"- {published}")
     rows: list[list[TableCell]] = [
@@ -117,23 +125,35 @@ def claims_section(results: Results) -> Section:
     )
 
 
-def sentence(findings: Sequence[Finding]) -> str:
-    """What a careful reader would say of a claim."""
+def sentence(findings: Sequence[Finding], *, done: bool = False) -> str:
+    """What a careful reader would say of a claim.
+
+    Args:
+        findings: those of its comparisons.
+        done: whether there are runs of both sides, be they such that nothing can be compared.
+    """
     if not findings:
-        return f"{NOT_RUN}."
+        return "nothing to compare." if done else f"{NOT_RUN}."
     counts = Counter(finding.verdict for finding in findings)
     total = len(findings)
     parts = [
         f"{verdict} in {counts[verdict]}"
-        for verdict in (SHOWN, NOT_SHOWN, REFUTED, MIXED, NOT_RUN)
+        for verdict in (SHOWN, NOT_SHOWN, REFUTED, MIXED, NOT_RUN, NOT_MEASURED)
         if counts[verdict]
     ]
     named = "; ".join(
         f"{verdict}: {', '.join(f.what for f in findings if f.verdict == verdict)}"
-        for verdict in (SHOWN, REFUTED, MIXED, NOT_RUN)
+        for verdict in (SHOWN, REFUTED, MIXED, NOT_RUN, NOT_MEASURED)
         if counts[verdict]
     )
     return f"{', '.join(parts)} of {total} comparisons{f' ({named})' if named else ''}."
+
+
+def _any_done(results: Results, systems: Iterable[Sequence[PaperSystem]]) -> bool:
+    """Whether all sides of any of these comparisons have a run on a task."""
+    return any(
+        all(results.has_run(one, task) for one in sides) for sides in systems for task in TASKS
+    )
 
 
 def fewer_samples(results: Results) -> list[Finding]:
@@ -142,7 +162,6 @@ def fewer_samples(results: Results) -> list[Finding]:
     for task in TASKS:
         ours, theirs = (efficiency_of_seeds(results, one, task) for one in (PHIHP, TD_MPC))
         scores = [results.scores(one, task) for one in (PHIHP, TD_MPC)]
-        seeds = _seeds(results, (PHIHP, TD_MPC), task, (ours, theirs), scores)
         if ours and theirs:
             between = mean_between(theirs), mean_between(ours)
             findings.append(
@@ -153,11 +172,11 @@ def fewer_samples(results: Results) -> list[Finding]:
                     FEWER,
                     f"{between[1]} against {between[0]} samples",
                     [score for side in scores for score in side],
-                    seeds,
+                    _seeds(results, (PHIHP, TD_MPC), task, (ours, theirs), *map(_samples, scores)),
                 )
             )
         elif results.planned.both(PHIHP, TD_MPC, task):
-            findings.append(_not_run(task, seeds))
+            findings.append(_absent(results, (PHIHP, TD_MPC), task, scores))
     return findings
 
 
@@ -166,10 +185,11 @@ def planning_improves(results: Results) -> list[Finding]:
     groups, pairs = usual_groups(results.runs), []
     for task in TASKS:
         group = groups.get(task, [])
-        planned = results.planned.seeds(PHIHP, task, group)
+        planned = results.planned.seeds(PHIHP, task, {run.samples for run in group})
         seeds = ", ".join([_of_planned(len(group), planned)] * 2)
         gap = planning_gain(group) if group else None
-        pairs.append(_Pair(task, task, gap, seeds, planned > 0))
+        absent = NOT_MEASURED if results.has_run(PHIHP, task) else NOT_RUN
+        pairs.append(_Pair(task, task, gap, seeds, planned > 0, absent))
     return _of_differences(pairs)
 
 
@@ -179,7 +199,6 @@ def faster(results: Results) -> list[Finding]:
     for task in TASKS:
         scores = [results.usual(system, task) for system in (PHIHP, TD_MPC)]
         ours, theirs = (_times(each) for each in scores)
-        seeds = _seeds(results, (PHIHP, TD_MPC), task, (ours, theirs), scores)
         if ours and theirs:
             findings.append(
                 _of_ratio(
@@ -189,11 +208,11 @@ def faster(results: Results) -> list[Finding]:
                     1.0,
                     f"{fmean(ours):.1f} ms against {fmean(theirs):.1f}",
                     [score for side in scores for score in side],
-                    seeds,
+                    _seeds(results, (PHIHP, TD_MPC), task, (ours, theirs), *map(_samples, scores)),
                 )
             )
         elif results.planned.both(PHIHP, TD_MPC, task):
-            findings.append(_not_run(task, seeds))
+            findings.append(_absent(results, (PHIHP, TD_MPC), task, scores))
     return findings
 
 
@@ -202,12 +221,16 @@ def _higher(results: Results, pairs: Iterable[tuple[PaperSystem, PaperSystem]]) 
     found = []
     for first, second in pairs:
         for task in TASKS:
-            sides = results.usual(first, task), results.usual(second, task)
-            if first is not PHIHP:
-                sides = _at_equal_samples(results, first, second, task)
-            what = task if first is PHIHP else f"{first.name} on {task}"
-            seeds = _seeds(results, (first, second), task, sides, sides)
-            planned = results.planned.both(first, second, task)
+            if first is PHIHP:
+                what, planned = task, results.planned.both(first, second, task)
+                sides = results.usual(first, task), results.usual(second, task)
+                samples = _samples(sides[0]), _samples(sides[1])
+            else:
+                what = f"{first.name} on {task}"
+                number, planned = _equal_samples(results, first, second, task)
+                sides = results.at(number, first, task), results.at(number, second, task)
+                samples = {number}, {number}
+            seeds = _seeds(results, (first, second), task, sides, *samples)
             found.append(_Pair(what, task, compared(*sides), seeds, planned))
     return _of_differences(found)
 
@@ -217,9 +240,10 @@ def _of_differences(pairs: Sequence[_Pair]) -> list[Finding]:
     findings = []
     p_values = [math.nan if pair.gap is None else pair.gap.p for pair in pairs]
     family = sum(pair.planned or not math.isnan(p) for pair, p in zip(pairs, p_values, strict=True))
-    for (what, task, gap, seeds, planned), p in zip(pairs, holm(p_values, family), strict=True):
+    for pair, p in zip(pairs, holm(p_values, family), strict=True):
+        what, task, gap, seeds, planned, absent = pair
         if gap is None:
-            findings += [_not_run(what, seeds)] if planned else []
+            findings += [Finding(what, absent, "–", "–", "–", seeds)] if planned else []
             continue
         verdict = NOT_SHOWN if not p < LEVEL else SHOWN if gap.mean > 0 else REFUTED
         if gap.mixed:
@@ -268,17 +292,24 @@ def _of_ratio(
     return Finding(what, verdict, effect, _times_text(ratio), _times_text(interval), seeds)
 
 
-def _not_run(what: str, seeds: str) -> Finding:
-    """That of a comparison that was planned, of which a side has no run."""
-    return Finding(what, NOT_RUN, "–", "–", "–", seeds)
+def _absent(
+    results: Results,
+    systems: tuple[PaperSystem, PaperSystem],
+    task: str,
+    scores: Sequence[Sequence[Score]],
+) -> Finding:
+    """That of a comparison that was planned, of which a side has no run or no number."""
+    runs = [{score.run.seed for score in side} for side in scores]
+    seeds = _seeds(results, systems, task, runs, *map(_samples, scores))
+    return Finding(task, NOT_MEASURED if all(runs) else NOT_RUN, "–", "–", "–", seeds)
 
 
 def _seeds(
     results: Results,
     systems: tuple[PaperSystem, PaperSystem],
     task: str,
-    values: tuple[Sequence[object], Sequence[object]],
-    scores: Sequence[Sequence[Score]],
+    values: Sequence[Collection[object]],
+    *samples: Collection[int],
 ) -> str:
     """The seeds of either side, such as ``7 of 10, 10``.
 
@@ -287,11 +318,11 @@ def _seeds(
         systems: the two sides.
         task: name of the task.
         values: one for each seed, by side.
-        scores: those that they are from, whose numbers of samples count.
+        samples: the numbers of real samples that are compared, by side.
     """
     planned = (
-        results.planned.seeds(system, task, [score.run for score in side])
-        for system, side in zip(systems, scores, strict=True)
+        results.planned.seeds(system, task, numbers)
+        for system, numbers in zip(systems, samples, strict=True)
     )
     return ", ".join(_of_planned(len(side), n) for side, n in zip(values, planned, strict=True))
 
@@ -305,15 +336,21 @@ def _times_text(ratio: Between) -> str:
     return f"{ratio.low:.1f}{above} times"
 
 
-def _at_equal_samples(
+def _samples(scores: Iterable[Score]) -> set[int]:
+    return {score.run.samples for score in scores}
+
+
+def _equal_samples(
     results: Results, first: PaperSystem, second: PaperSystem, task: str
-) -> tuple[list[Score], list[Score]]:
-    """The scores of both at the largest number of samples that both have enough seeds of."""
-    both = [results.scores(system, task) for system in (first, second)]
+) -> tuple[int, bool]:
+    """The number of real samples to compare two systems at, and whether that was planned.
+
+    It is the largest that both have enough seeds of, or else the largest that was planned for both.
+    """
+    both = (results.scores(system, task) for system in (first, second))
     filled = well_filled(*([score.run.samples for score in scores] for scores in both))
-    ours, theirs = ([s for s in scores if s.run.samples == max(filled, default=0)]
-                    for scores in both)  # fmt: skip
-    return ours, theirs
+    asked = results.planned.at_equal_samples(first, second, task)
+    return max(filled or asked, default=0), bool(asked)
 
 
 def _times(scores: Sequence[Score]) -> list[float]:

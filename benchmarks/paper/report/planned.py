@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from grid.cell import Cell, CellFiles
+from grid.planned import read_cells
 from grid.status import read_failure
-from phihp_torchrl.config import ConfigError
+from measures import DEFAULT_SAMPLES
+from phihp_torchrl.config import METHODS
 from report.paper_systems import PaperSystem
 from report.runs import Run
 from report.sections import Section
@@ -19,6 +20,24 @@ from report.tables import Number, Table, TableCell
 
 _LONGEST = 160
 """Characters of an error in a table; all of it is in ``failure.json``."""
+
+_SAMPLES_KEY = "model.real_steps"
+"""What a preset has a number of real samples for, by task."""
+
+
+def samples_of(cell: Cell) -> int | None:
+    """The real samples of a planned cell; ``None`` where nobody knows before it is run.
+
+    Examples:
+        >>> samples_of(Cell("phihp", "pendulum", 0, 500)), samples_of(Cell("phihp", "pendulum", 0))
+        (500, 1000)
+        >>> samples_of(Cell("td3", "pendulum", 0)) is None
+        True
+    """
+    if cell.samples is not None:
+        return cell.samples
+    method = METHODS.get(cell.method)  # without its plugin it is not known
+    return DEFAULT_SAMPLES.get(cell.task) if method and method.samples_key == _SAMPLES_KEY else None
 
 
 @dataclass(frozen=True)
@@ -37,22 +56,20 @@ class Planned:
         """The cells with one label."""
         return replace(self, cells=tuple(cell for cell in self.cells if cell.label == label))
 
-    def seeds(self, system: PaperSystem, task: str, runs: Iterable[Run] = ()) -> int:
+    def seeds(self, system: PaperSystem, task: str, samples: Collection[int] = ()) -> int:
         """The number of training seeds that were planned for a system on a task.
 
         Args:
             system: the system; a run of any of its methods would do.
             task: name of the task.
-            runs: those that are compared; only cells of their numbers of samples count then.
+            samples: the numbers of real samples that are compared; by default, all.
         """
-        methods = {method for method, _ in system.sources}
-        numbers = {run.samples for run in runs}
+        counted = {None, *samples}  # of a cell whose number nobody knows, it may be any
         return len(
             {
                 cell.seed
-                for cell in self.cells
-                if (cell.task == task and cell.method in methods)
-                and (not numbers or cell.samples is None or cell.samples in numbers)
+                for cell in self._cells(system, task)
+                if not samples or samples_of(cell) in counted
             }
         )
 
@@ -60,25 +77,33 @@ class Planned:
         """Whether a comparison of two systems on a task was planned."""
         return self.seeds(first, task) > 0 and self.seeds(second, task) > 0
 
+    def at_equal_samples(self, first: PaperSystem, second: PaperSystem, task: str) -> set[int]:
+        """The numbers of real samples at which a comparison of two systems was planned."""
+        sides = [
+            {samples_of(cell) for cell in self._cells(system, task)} for system in (first, second)
+        ]
+        return {
+            number
+            for number in set.union(*sides)
+            if number is not None and all({None, number} & side for side in sides)
+        }
+
+    def _cells(self, system: PaperSystem, task: str) -> list[Cell]:
+        """Those of any of a system's methods on a task."""
+        methods = {method for method, _ in system.sources}
+        return [cell for cell in self.cells if cell.task == task and cell.method in methods]
+
 
 def read_planned(directory: Path) -> Planned:
     """Read ``planned.json`` and all ``failure.json`` of a directory of runs.
 
     Raises:
-        ConfigError: for a plan that cannot be read; without it, every missing run would be lost.
+        ConfigError: for a plan that cannot be read.
     """
     files = CellFiles(Cell("any", "any", 0), directory, directory)
     failures = {path.parent.name: read_failure(path)
                 for path in sorted(directory.glob(f"*/{files.kept_failure.name}"))}  # fmt: skip
-    if not files.planned.is_file():
-        return Planned((), failures)
-    try:
-        cells = tuple(Cell(**cell) for cell in json.loads(files.planned.read_text()).values())
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        raise ConfigError(
-            "runs", f"expected a description of each cell in {files.planned}, got {error}."
-        ) from error
-    return Planned(cells, failures)
+    return Planned(tuple(read_cells(files.planned, "runs").values()), failures)
 
 
 def planned_section(planned: Planned, runs: Sequence[Run]) -> Section:

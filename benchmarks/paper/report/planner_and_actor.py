@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 
 from measures import (
-    DEFAULT_SAMPLES,
     PUBLISHED_SAMPLES,
     Difference,
     agent_in,
@@ -17,7 +16,7 @@ from measures import (
 from phihp_torchrl.evaluation import TARGETS, TaskResult, returns_table
 from report.comparison import numbers, unless_mixed
 from report.paper_systems import AGENT
-from report.planned import Planned
+from report.planned import Planned, samples_of
 from report.results import usual_samples
 from report.runs import Run
 from report.sections import Section
@@ -97,8 +96,7 @@ def acting_section(runs: Sequence[Run], planned: Planned | None = None) -> Secti
 def _gain_table(groups: dict[tuple[str, int], list[Run]], planned: Planned) -> Table:
     found = {key: planning_gain(group) for key, group in groups.items()}
     tested = {key for key, gain in found.items() if not math.isnan(gain.p)}
-    asked = {(cell.task, cell.samples or DEFAULT_SAMPLES.get(cell.task))
-             for cell in planned.cells if cell.method == "phihp"}  # fmt: skip
+    asked = {(cell.task, samples_of(cell)) for cell in planned.cells if cell.method == "phihp"}
     adjusted = holm([gain.p for gain in found.values()], len(tested | asked))
     rows: list[list[TableCell]] = [
         [task, str(samples), *numbers(gain, p, 2), str(gain.seeds[0])]

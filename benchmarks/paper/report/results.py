@@ -129,8 +129,11 @@ class Results:
     def usual(self, system: PaperSystem, task: str) -> list[Score]:
         """The scores at the usual number of real samples, by seed."""
         scores = self.scores(system, task)
-        chosen = usual_samples(task, (score.run.samples for score in scores))
-        return [score for score in scores if score.run.samples == chosen]
+        return self.at(usual_samples(task, (score.run.samples for score in scores)), system, task)
+
+    def at(self, samples: int, system: PaperSystem, task: str) -> list[Score]:
+        """The scores at a number of real samples, by seed."""
+        return [score for score in self.scores(system, task) if score.run.samples == samples]
 
     def has_run(self, system: PaperSystem, task: str) -> bool:
         """Whether there is a score."""

@@ -89,6 +89,17 @@ def test_code_without_a_commit_is_refused_before_anything_is_planned(
     assert not (tmp_path / "results").exists()
 
 
+def test_an_earlier_plan_that_cannot_be_read_is_one_sentence_and_no_run(
+    run_script: Callable[..., None], tmp_path: Path
+) -> None:
+    planned = tmp_path / "results" / "runs" / "planned.json"
+    planned.parent.mkdir(parents=True)
+    planned.write_text('["pendulum-default-n1000-seed0"]')
+    with pytest.raises(SystemExit, match=r"^error: results: expected a description of each cell"):
+        run_script("run_grid", "task=pendulum", "allow_dirty=true")
+    assert not [*(tmp_path / "outputs" / "grid").glob("*/")]
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("task", ["pendulum", "acrobot-swingup"])
 def test_every_method_composes(method: str, task: str) -> None:

@@ -57,6 +57,18 @@ def test_the_planned_cells_of_all_commands_are_noted(config: GridConfig, tmp_pat
     assert len(json.loads(elsewhere[0].planned.read_text())) == 1
 
 
+@pytest.mark.parametrize("torn", ['["pendulum-seed0"]', "{", '{"a": 3}', '{"a": {"task": "b"}}'])
+def test_an_earlier_plan_that_cannot_be_read_is_kept_and_named(
+    config: GridConfig, torn: str
+) -> None:
+    planned = config.files(Path()).planned
+    planned.parent.mkdir(parents=True, exist_ok=True)
+    planned.write_text(torn)
+    with pytest.raises(ConfigError, match=r"^results: expected a description of each cell in"):
+        keep_names([config.files(Path())])
+    assert planned.read_text() == torn
+
+
 def test_workers_get_a_table_that_shows_nothing() -> None:
     live = LiveTable()
     live._lines = 7

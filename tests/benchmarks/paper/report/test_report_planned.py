@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from measures import holm
 from phihp_torchrl.config import ConfigError
 from report import Results, read_runs
 from report.claims import claims_section
-from report.planned import planned_section, read_planned
+from report.planned import planned_section, read_planned, samples_of
 
 
 def make_planned(runs: Path, *cells: Cell) -> None:
@@ -99,6 +100,78 @@ def test_a_side_that_was_planned_and_is_missing_is_named(tmp_path: Path) -> None
         assert (verdict, n) == ("not run", "3 of 4, 0 of 3")
     text = claims_section(Results(read_runs(tmp_path).runs, read_planned(tmp_path))).text
     assert "not run in 1 of 1 comparisons (not run: pendulum)" in text
+
+
+def test_systems_planned_at_different_samples_are_no_comparison(tmp_path: Path) -> None:
+    """Both are done, and nothing was asked for that could be tested."""
+    ours, theirs = (
+        [Cell(method, "pendulum", 100 + seed, samples) for seed in range(3)]
+        for method, samples in (("ph-cem", 500), ("dd-cem", 1000))
+    )
+    im = [Cell(f"td3-im-{kind}", "pendulum", 100 + seed, 1000) for kind in ("ph", "dd")
+          for seed in range(3)]  # fmt: skip
+    make_planned(tmp_path, *im)
+    plan(tmp_path, *im)
+    alone = rows(tmp_path)["4, TD3-im-ph on pendulum"]
+    make_planned(tmp_path, *ours, *theirs)
+    plan(tmp_path, *ours, *theirs)
+    assert rows(tmp_path) == {"4, TD3-im-ph on pendulum": alone}  # of a family of one
+    # A cell of one side at the samples of the other makes it one.
+    plan(tmp_path, Cell("dd-cem", "pendulum", 100, 500))
+    assert rows(tmp_path)["4, Ph-CEM on pendulum"] == ["not run", "–", "–", "–", "3, 0 of 1"]
+
+
+def test_a_comparison_at_equal_samples_is_missing_where_it_was_planned(tmp_path: Path) -> None:
+    """Where nothing is done at equal samples, those that were planned are named."""
+    cells = {
+        (method, samples): [Cell(method, "pendulum", 100 + seed, samples) for seed in range(count)]
+        for method, samples, count in (
+            ("ph-cem", 500, 3), ("ph-cem", 1000, 4), ("dd-cem", 1000, 5), ("dd-cem", 2000, 6)
+        )
+    }  # fmt: skip
+    make_planned(tmp_path, *cells["ph-cem", 500], *cells["dd-cem", 1000])
+    plan(tmp_path, *(cell for group in cells.values() for cell in group))
+    assert rows(tmp_path)["4, Ph-CEM on pendulum"][-1] == "0 of 4, 5"
+
+
+def test_runs_without_the_number_that_is_compared_are_not_missing(tmp_path: Path) -> None:
+    cells = [*seeds(), *seeds("td-mpc")]
+    make_planned(tmp_path, *cells)
+    plan(tmp_path, *cells)
+    assert rows(tmp_path)["5, pendulum"][0] == "not shown"
+    for cell in cells:  # evaluate.latency_actions=0
+        path = tmp_path / cell.name / "evaluation.json"
+        parts = json.loads(path.read_text())
+        path.write_text(json.dumps({way: {"returns": p["returns"]} for way, p in parts.items()}))
+    assert rows(tmp_path)["5, pendulum"] == ["not measured", "–", "–", "–", "3, 3"]
+    text = claims_section(Results(read_runs(tmp_path).runs, read_planned(tmp_path))).text
+    line = text.splitlines()[4]
+    assert line.endswith("**: not measured in 1 of 1 comparisons (not measured: pendulum).")
+
+
+def test_planned_seeds_are_those_of_the_samples_that_are_compared(tmp_path: Path) -> None:
+    few = [Cell("phihp", "pendulum", 100 + seed, 500) for seed in range(3)]
+    usual = [Cell("phihp", "pendulum", 100 + seed) for seed in range(10)]
+    make_planned(tmp_path, *few)
+    plan(tmp_path, *few, *usual)
+    assert rows(tmp_path)["3, pendulum"][-1] == "3, 3"
+    make_planned(tmp_path, *usual[:4])
+    assert rows(tmp_path)["3, pendulum"][-1] == "4 of 10, 4 of 10"
+    make(tmp_path, tmp_path)
+    (gain, _) = table(tmp_path, "planning_gain")  # a family of two, by both rules
+    p = float(rows(tmp_path)["3, pendulum"][1].split("p = ")[1])
+    assert float(gain["p"]) == pytest.approx(2 * p, rel=0.05)
+
+
+def test_the_samples_of_a_planned_cell() -> None:
+    assert samples_of(Cell("phihp", "pendulum", 0, 500)) == 500
+    assert samples_of(Cell("phihp", "pendulum", 0)) == 1000  # the default preset's
+    for cell in (
+        Cell("td-mpc", "pendulum", 0),
+        Cell("phihp", "nobody-knows", 0),
+        Cell("of-a-plugin", "pendulum", 0),
+    ):
+        assert samples_of(cell) is None
 
 
 def test_baselines_that_were_planned_count_in_the_table_of_differences(tmp_path: Path) -> None:
