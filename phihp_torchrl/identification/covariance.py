@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +14,10 @@ _OPEN = 0.3
 """Standard error of a logarithm from which on a direction counts as not determined."""
 SHARE = 0.1
 """Part that a parameter must have in such a direction to be touched by it."""
+_STEEPEST = 4.0
+"""The largest power of a product. Larger ones are no physics, but any number is near to one."""
+_PAIRED = {0.5, 1.0, 2.0}
+"""Powers in pairs that are tried one by one, where many tries make a chance hit likely."""
 
 
 @dataclass(frozen=True)
@@ -88,38 +93,68 @@ def _quantile(freedom: int, intervals: int) -> float:
     return z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)
 
 
-def monomials(open_directions: Tensor, among: list[int]) -> list[dict[int, float]] | None:
+def monomials(open_directions: Tensor, among: list[int]) -> list[dict[int, float]]:
     """Products of powers that stay the same along open directions.
+
+    A direction may be simple for some constants alone: a motor's torque constant stands in the drag
+    as well, as what it brakes, and so only the others go with it in proportion. Products of those
+    are found, pairs of them where the products that come first leave any out.
 
     Args:
         open_directions: in logarithms of the constants, ``[d, p]``.
         among: parameters that may take part; their constants are positive.
 
     Returns:
-        Exponents by parameter, for each product; ``None`` if the exponents are not simple ratios.
+        Exponents by parameter, for each product. Those that are no simple ratios are left out.
 
     Examples:
         >>> monomials(torch.tensor([[0.6, 0.0, 0.6]]), [0, 1, 2])
         [{2: 1.0, 0: -1.0}]
+        >>> monomials(torch.tensor([[0.14, 0.57, 0.57, 0.57]]), [0, 1, 2, 3])
+        [{2: 1.0, 1: -1.0}, {3: 1.0, 1: -1.0}]
     """
     inside = [i for i in among if bool((open_directions[:, i].abs() > SHARE).any())]
     if not inside:
         return []
-    matrix, pivots = _reduced(open_directions[:, inside])
-    found = []
-    for column, i in enumerate(inside):
-        if column in pivots:
-            continue
-        exponents = {i: 1.0}
-        for row, pivot in enumerate(pivots):
-            exact = -float(matrix[row, column])
-            simple = round(6.0 * exact) / 6.0  # halves and thirds
-            if abs(simple - exact) > 0.03:
-                return None
-            if simple:
-                exponents[inside[pivot]] = simple
-        found.append(exponents)
+    products = _products(open_directions, inside)
+    found = [product for product in products if product]
+    if len(found) == len(products):
+        return found
+    for i, j in itertools.combinations(inside, 2):
+        for pair in _products(open_directions, [i, j]):
+            plain = pair and {abs(power) for power in pair.values()} <= _PAIRED
+            if plain and _rank([*found, pair], inside) > len(found):
+                found.append(pair)
     return found
+
+
+def _products(open_directions: Tensor, inside: list[int]) -> list[dict[int, float]]:
+    """One product for each dimension that these parameters leave; empty where it is not simple."""
+    matrix, pivots = _reduced(open_directions[:, inside])
+    free = [column for column in range(len(inside)) if column not in pivots]
+    return [
+        _simple(matrix[:, column], [inside[p] for p in pivots], inside[column]) for column in free
+    ]
+
+
+def _simple(column: Tensor, pivots: list[int], own: int) -> dict[int, float]:
+    """Exponents of a product, or none if they are not simple ratios."""
+    exponents = {own: 1.0}
+    for pivot, value in zip(pivots, column.tolist(), strict=True):
+        simple = min(
+            round(-2.0 * value) / 2.0, round(-3.0 * value) / 3.0, key=lambda s: abs(s + value)
+        )
+        if abs(simple + value) > 0.03 or abs(simple) > _STEEPEST:
+            return {}
+        if simple:
+            exponents[pivot] = simple
+    return exponents
+
+
+def _rank(products: list[dict[int, float]], inside: list[int]) -> int:
+    """How many of the products do not follow from the others."""
+    exponents = [[product.get(i, 0.0) for i in inside] for product in products]
+    return int(torch.linalg.matrix_rank(torch.tensor(exponents, dtype=torch.float64)))
 
 
 def _reduced(matrix: Tensor) -> tuple[Tensor, list[int]]:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from phihp_torchrl.identification.config import AUTO, IdentifyConfig
 from phihp_torchrl.identification.fitting import Fitted
 from phihp_torchrl.identification.parts import (
     AT_LIMIT,
@@ -24,6 +25,7 @@ from phihp_torchrl.identification.shooting import Fit
 from phihp_torchrl.identification.stops import Stops
 from phihp_torchrl.identification.windows import Samples, Windows
 from phihp_torchrl.systems import System
+from phihp_torchrl.tasks import Actuator
 
 BEFORE = 5
 """How many previous commands are looked at."""
@@ -58,10 +60,39 @@ def of_constants(constants: Mapping[str, Estimate]) -> list[Finding]:
     return found
 
 
+def late_advice(config: IdentifyConfig, path: Actuator) -> str:
+    """What to do where commands act late, of what was not done already.
+
+    Examples:
+        >>> late_advice(IdentifyConfig(lag=0.0), Actuator())
+        "The command acts late or slowly: let lag be 'auto'."
+        >>> late_advice(IdentifyConfig(largest_delay=2), Actuator(delay_steps=1.8))
+        'The command acts late or slowly: allow a larger largest_delay than 2.'
+    """
+    given = [name for name in ("delay", "lag") if getattr(config, name) != AUTO]
+    todo = [f"let {' and '.join(given)} be 'auto'"] if given else []
+    delays = path.delay_steps if isinstance(path.delay_steps, tuple) else (path.delay_steps,)
+    if config.delay == AUTO and max(delays) > config.largest_delay - 1:
+        todo.append(f"allow a larger largest_delay than {config.largest_delay}")
+    what = ", or ".join(todo) or (
+        "in another way than the delays and lags that were tried. See whether the time stamps are "
+        "those of the samples, and what the drive does to a command"
+    )
+    return f"The command acts late or slowly{':' if todo else ','} {what}."
+
+
 def of_residuals(
-    system: System, samples: Samples, windows: Windows, fit: Fit
+    system: System, samples: Samples, windows: Windows, fit: Fit, late: str
 ) -> tuple[list[Finding], Residuals]:
-    """Whether residuals are white, and whether previous commands explain them."""
+    """Whether residuals are white, and whether previous commands explain them.
+
+    Args:
+        system: names of the states.
+        samples: the recordings.
+        windows: what was fitted.
+        fit: what is left over.
+        late: what to do where commands before explain it.
+    """
     found, white = [], {}
     steps = torch.arange(1, BEFORE + 1)
     for i, name in enumerate(system.state_names):
@@ -97,8 +128,7 @@ def of_residuals(
                 Finding(
                     "delay",
                     f"{name}: the commands before explain {100 * share:.0f} % of the residual.",
-                    "The command acts late or slowly: let delay and lag be 'auto', or allow a "
-                    "larger largest_delay.",
+                    late,
                 )
             )
     return found, _residuals(system, samples, windows, fit, white)

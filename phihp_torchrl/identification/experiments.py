@@ -12,8 +12,7 @@ from phihp_torchrl.identification.windows import Samples, make_windows
 _ROLLOUTS, _LENGTH = 8, 80
 _NONE = (
     "No experiment with these measurements tells it by itself: only combinations act on the "
-    "motion. Measure one of them otherwise and fix it with Constant(value, fixed=True), or use the "
-    "combinations."
+    "motion. Measure one of them otherwise and fix it with Constant(value, fixed=True)"
 )
 
 
@@ -26,10 +25,21 @@ class Experiments:
         samples: the recordings.
         low: lower bounds of the actions ``[m]``.
         high: upper bounds.
+        combined: whether the data determine combinations of constants, which can be used instead.
     """
 
-    def __init__(self, model: Model, fit: Fit, samples: Samples, low: Tensor, high: Tensor) -> None:
+    def __init__(
+        self,
+        model: Model,
+        fit: Fit,
+        samples: Samples,
+        low: Tensor,
+        high: Tensor,
+        *,
+        combined: bool = False,
+    ) -> None:
         self.model, self.fit, self.samples, self.low, self.high = model, fit, samples, low, high
+        self.combined = combined
         self._found: dict[str, Tensor] | None = None
 
     def advise(self, direction: Tensor) -> str:
@@ -37,7 +47,7 @@ class Experiments:
         told = {name: float(direction @ m @ direction) for name, m in self._informations().items()}
         best = max(told, key=told.__getitem__, default="")
         if not best or told[best] < 1.0:
-            return _NONE
+            return f"{_NONE}, or use the combinations." if self.combined else f"{_NONE}."
         error = min(told[best] ** -0.5, 9.99)
         return (
             f"It shows best in {best}: as many samples of that would leave a standard error of "

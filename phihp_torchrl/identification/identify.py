@@ -117,12 +117,14 @@ def _report(
     system, model, fit, division = task.system, fitted.model, fitted.fit, fitted.division
     doubt = uncertainty(fit, scale_of(model, fit.raw))
     low, high = task.bounds.low.double(), task.bounds.high.double()
-    experiments = Experiments(model, fit, samples, low, high)
-    constants = judge_constants(model, fit.raw, doubt, experiments.advise)
     combinations = judge_combinations(model, fit.raw, doubt)
+    combined = any(c.low is not None for c in combinations.values())
+    experiments = Experiments(model, fit, samples, low, high, combined=combined)
+    constants = judge_constants(model, fit.raw, doubt, experiments.advise)
     past = (division.past, config.past)
     judged = judge_predictions(fitted.stopping, samples, fitted.judged, division, past, recordings)
-    more, residuals = diagnostics.of_residuals(system, samples, fitted.windows, fit)
+    late = diagnostics.late_advice(config, model.actuator(fit.raw))
+    more, residuals = diagnostics.of_residuals(system, samples, fitted.windows, fit, late)
     beyond = diagnostics.of_errors(judged.errors)
     if any(finding.code in ("white", "incomplete") for finding in (*more, *beyond)):
         loose = loosen(fitted, samples)
@@ -130,7 +132,7 @@ def _report(
         combinations = doubted(combinations, loose.combinations)
     warnings = [
         *diagnostics.of_constants(constants),
-        *of_recordings(system, samples),
+        *of_recordings(task, samples),
         *spikes,
         *more,
         *of_path(fitted.tried),

@@ -7,14 +7,20 @@ import torch
 from phihp_torchrl.identification.parts import Finding
 from phihp_torchrl.identification.windows import Samples
 from phihp_torchrl.systems import System
+from phihp_torchrl.tasks import Task
 
 _JITTER = 0.02
 """Spread of the intervals, as a share of their mean, from which on a clock is irregular."""
+_BEYOND = 0.01
+"""Share of the commands beyond the bounds from which on they are named. Fewer may be glitches of a
+log; a wrong unit takes nearly all, or, where a drive mostly rests, those that move it."""
+_SLACK = 0.05
+"""By how much of the range a command may be beyond a bound, as the noise of a measured one is."""
 
 
-def of_recordings(system: System, samples: Samples) -> list[Finding]:
-    """Clock, missing samples, commands that never change, velocities that are none."""
-    found = []
+def of_recordings(task: Task, samples: Samples) -> list[Finding]:
+    """Clock, missing samples, commands beyond their bounds or still, velocities that are none."""
+    system, found = task.system, _beyond(task, samples)
     inside = samples.stretch[1:] == samples.stretch[:-1]
     intervals = samples.interval[:-1][inside]
     spread = float(intervals.std() / intervals.mean()) if len(intervals) > 1 else 0.0
@@ -48,6 +54,31 @@ def of_recordings(system: System, samples: Samples) -> list[Finding]:
                 )
             )
     return found + _velocities(system, samples)
+
+
+def _beyond(task: Task, samples: Samples) -> list[Finding]:
+    """Commands that the task does not allow, as those in a wrong unit are."""
+    found = []
+    low, high = task.bounds.low.to(samples.action), task.bounds.high.to(samples.action)
+    slack = _SLACK * (high - low)
+    for i, name in enumerate(task.system.action_names):
+        given = samples.action[:, i]
+        below, above = (given < low[i] - slack[i]), (given > high[i] + slack[i])
+        share = float((below | above).double().mean())
+        if share < _BEYOND:
+            continue
+        bounds = {"action_low": (below, low[i]), "action_high": (above, high[i])}
+        passed = " or ".join(f"{n}={float(x):.4g}" for n, (out, x) in bounds.items() if out.any())
+        found.append(
+            Finding(
+                "bounds",
+                f"{name}: {100 * share:.0f} % of the commands are beyond {passed}; they go from "
+                f"{float(given.min()):.4g} to {float(given.max()):.4g}.",
+                "Check the unit and the scale of the column: with wrong ones, all constants are "
+                "wrong too. If they are right, widen Task(action_low=..., action_high=...).",
+            )
+        )
+    return found
 
 
 def _velocities(system: System, samples: Samples) -> list[Finding]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -23,6 +24,8 @@ from phihp_torchrl.identification.parts import (
 )
 from phihp_torchrl.identification.table import lay_out
 from phihp_torchrl.tasks import Actuator, Task
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,8 @@ class Identification:
 
         Args:
             task: the task that was identified.
-            fixed: whether constants that are identified are fixed, so that training keeps them.
+            fixed: whether constants that are identified are fixed, so that training keeps them. A
+                warning says so where there are none.
 
         Raises:
             ConfigError: if its system does not have the constants.
@@ -124,6 +128,15 @@ class Identification:
         system = task.system.with_constants(values)
         if fixed:
             known = [name for name, c in free.items() if c.verdict == IDENTIFIED]
+            if free and not known:
+                _log.warning(
+                    "fixed=True fixes no constant of %s, and training goes on to fit %s: none has "
+                    "the verdict %r. Fix one that is known otherwise with "
+                    "Constant(value, fixed=True), and identify again.",
+                    task.name,
+                    ", ".join(free),
+                    IDENTIFIED,
+                )
             system.ranges |= {n: replace(system.ranges[n], fixed=True) for n in known}
         return replace(
             task,

@@ -120,7 +120,7 @@ def judge_combinations(model: Model, raw: Tensor, doubt: Uncertainty) -> dict[st
         for i, name in enumerate(model.prior.learned)
         if not model.prior.ranges[name].bounded or model.prior.ranges[name].low >= 0
     ]
-    for exponents in monomials(doubt.open, positive) or []:
+    for exponents in monomials(doubt.open, positive):
         powers = {model.prior.learned[i]: power for i, power in exponents.items()}
         if len(powers) > 1:
             estimate = _combination(model, raw, doubt, partial(_product, powers))

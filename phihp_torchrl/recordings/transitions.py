@@ -18,6 +18,10 @@ _log = logging.getLogger(__name__)
 
 _SLACK = 1e-4
 """By how much of its range a command may be beyond a bound, as rounding in a log does."""
+_MOST = 0.5
+"""Share of the transitions that may be left out for their commands. Spikes, a drive that is driven
+by hand, or bounds that are narrower than the log's take some. A wrong unit takes all but those near
+zero, and then a model of the few that are left would be nonsense that looks like a fit."""
 
 
 def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
@@ -40,7 +44,8 @@ def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
 
     Raises:
         ConfigError: for recordings of another system or without its inputs, a state that was never
-            measured, and if nothing is left.
+            measured, commands of which most are beyond the bounds or the rate, and if nothing is
+            left.
 
     Examples:
         >>> from phihp_torchrl import get_task
@@ -57,6 +62,7 @@ def transitions(task: Task, recordings: Sequence[Recording]) -> TensorDict:
         for log, before in zip(recordings, (None, *recordings), strict=False)
         if len(part := _of(task, log, _goes_on(log, before), left))
     ]
+    _check_commands(task, recordings, left, sum(map(len, parts)))
     for reason, count in left.items():
         _log.warning("%d recorded transitions are left out: %s.", count, reason)
     if not parts:
@@ -97,6 +103,44 @@ def _check(task: Task, recordings: Sequence[Recording]) -> None:
         )
 
 
+def _check_commands(
+    task: Task, recordings: Sequence[Recording], left: Counter[str], used: int
+) -> None:
+    """Refuse recordings most of whose commands the task does not allow."""
+    beyond, faster = left[_beyond(task)], left[_faster(task)]
+    usable = used + beyond + faster
+    if beyond + faster <= _MOST * usable:
+        return
+    given = torch.cat([log.action for log in recordings])
+    rates = torch.cat([log.action.diff(dim=0).abs() / log.intervals[:, None] for log in recordings])
+    sizes = (x.tolist() for x in (given.amin(0), given.amax(0), rates.amax(0)))
+    ranges = ", ".join(
+        f"{name} from {low:.4g} to {high:.4g} that changes by up to {rate:.4g} a second"
+        for name, low, high, rate in zip(task.system.action_names, *sizes, strict=True)
+    )
+    reasons = [r for r, count in ((_beyond(task), beyond), (_faster(task), faster)) if count]
+    raise ConfigError(
+        "recordings",
+        f"{beyond + faster} of {usable} transitions would be left out: {'. Or '.join(reasons)}. "
+        f"The recordings have {ranges}.",
+    )
+
+
+def _beyond(task: Task) -> str:
+    return (
+        f"their commands are beyond the bounds of task {task.name!r}, {task.action_low} to "
+        f"{task.action_high}; check the unit and scale of the column, or widen those in "
+        "Task(action_low=..., action_high=...)"
+    )
+
+
+def _faster(task: Task) -> str:
+    return (
+        f"their commands change faster than the action_rate_limit of task {task.name!r}, "
+        f"{task.action_rate_limit}; check the unit and scale of the column, or raise that limit"
+    )
+
+
 def _goes_on(log: Recording, before: Recording | None) -> bool:
     """Whether a stretch starts in the middle of an episode."""
     return (
@@ -119,15 +163,9 @@ def _of(task: Task, log: Recording, goes_on: bool, left: Counter[str]) -> Tensor
         early = log.time[:-1] < log.time[0] + task.registers.memory(task.time_step)
         left["what was under way before their stretch is unknown"] += int((early & ~unknown).sum())
         unknown |= early
-    left[
-        f"their commands are beyond the bounds of task {task.name!r}, {task.action_low} to "
-        f"{task.action_high}; widen those in Task(action_low=..., action_high=...)"
-    ] += int((outside & ~unknown).sum())
+    left[_beyond(task)] += int((outside & ~unknown).sum())
     outside |= (fast := _too_fast(task, observation[:-1], action, log.intervals) & ~outside)
-    left[
-        f"their commands change faster than the action_rate_limit of task {task.name!r}, "
-        f"{task.action_rate_limit}"
-    ] += int((fast & ~unknown).sum())
+    left[_faster(task)] += int((fast & ~unknown).sum())
     left -= Counter()  # drops the zeros
     use = ~(unknown | outside)
     at = use.nonzero()[:, 0]

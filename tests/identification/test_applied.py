@@ -10,6 +10,7 @@ import pytest
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.identification import Identification, identified_task
 from phihp_torchrl.identification.parts import (
+    COMBINED,
     NOT_IDENTIFIED,
     ActuatorEstimate,
     Estimate,
@@ -50,6 +51,21 @@ def test_what_is_identified_can_be_kept(report):
     kept = {name for name, c in task.system.ranges.items() if c.fixed}
     assert kept == {"length"} | {n for n, c in TASK.system.ranges.items() if c.fixed}
     assert not TASK.system.ranges["length"].fixed
+
+
+def test_nothing_to_keep_is_said(report, caplog):
+    path = report / "identification.json"
+    plain = json.loads(path.read_text())
+    identified_task(TASK, path, fixed=True)
+    assert not caplog.records
+    plain["constants"]["length"]["verdict"] = COMBINED + "mass"
+    path.write_text(json.dumps(plain))
+    identified_task(TASK, path)
+    assert not caplog.records
+    task = identified_task(TASK, path, fixed=True)
+    assert not task.system.ranges["length"].fixed
+    assert "fixed=True fixes no constant of pendulum" in caplog.text
+    assert "to fit length, mass" in caplog.text
 
 
 def test_a_delay_is_counted_in_steps_of_the_task(report):

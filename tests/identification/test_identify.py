@@ -8,13 +8,15 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.identification import Identification, IdentifyConfig, identify
-from phihp_torchrl.identification.diagnostics import of_errors
+from phihp_torchrl.identification.diagnostics import late_advice, of_errors
 from phihp_torchrl.identification.parts import IDENTIFIED, HorizonError, StateError
 from phihp_torchrl.integrators import make_integrator
 from phihp_torchrl.recordings import Recording
+from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import Actuator
 from tests import followed
 from tests.identification.rigs import MASS, ROD, Mass, Rod, make_task, record
@@ -191,6 +193,77 @@ def test_a_command_that_never_changes_tells_nothing_of_its_gain() -> None:
     assert "action" in found.constants["gain"].advice
     assert {"unknown", "excitation"} <= codes(found)
     assert all(inside(found, {"stiffness": 6.0, "damping": 0.5}).values())
+
+
+@pytest.mark.parametrize(("scale", "share"), [(1000.0, 99), (1.04, 0)])
+def test_commands_in_other_units_are_named(scale: float, share: int) -> None:
+    log = record(Mass(), MASS, noise=(1e-3, UNSEEN), samples=400)
+    wrong = Recording(log.time, log.state, scale * log.action)
+    found = identify(make_task(Mass()), [wrong], IdentifyConfig(**PLAIN))
+    texts = [finding.text for finding in found.warnings if finding.code == "bounds"]
+    assert len(texts) == bool(share)
+    for text in texts:
+        assert "beyond action_low=-5 or action_high=5; they go from -4" in text
+        assert int(text.split()[1]) >= share
+        assert text in found.table()
+        assert any(text in warning for warning in found.to_json()["warnings"])
+
+
+class Servo(System):
+    """A motor whose torque constant also brakes it, so that no product has the drag."""
+
+    state_names, action_names = ("angle", "speed"), ("volts",)
+    velocity_of = {"angle": "speed"}
+    default_constants = {"drag": 0.001, "inertia": 0.002, "torque": 0.05}
+
+    def prior(self, state: Tensor, action: Tensor, constants: dict) -> Tensor:
+        drag, inertia, torque = constants.values()
+        speed = state[..., 1]
+        force = torque * (action[..., 0] - torque * speed) - drag * speed
+        return torch.stack([speed, force / inertia], -1)
+
+
+class Sum(System):
+    """A mass of which the motion tells a sum alone."""
+
+    state_names, action_names = ("x", "v"), ("force",)
+    velocity_of = {"x": "v"}
+    default_constants = {"motor": 0.5, "hand": 0.3}
+
+    def prior(self, state: Tensor, action: Tensor, constants: dict) -> Tensor:
+        gain = constants["motor"] + constants["hand"]
+        return torch.stack([state[..., 1], gain * action[..., 0] - state[..., 0]], -1)
+
+
+def test_pairs_are_found_where_others_are_in_no_proportion() -> None:
+    truth = {"drag": 0.0015, "inertia": 0.0025, "torque": 0.06}
+    log = record(Servo(), truth, noise=(1e-3, UNSEEN), samples=800)
+    found = identify(make_task(Servo()), [log], IdentifyConfig(**PLAIN))
+    assert {c.verdict[:25] for c in found.constants.values()} == {"only in combination with "}
+    assert list(found.combinations) == ["torque / inertia"]
+    quotient = found.combinations["torque / inertia"]
+    assert quotient.low <= 24.0 <= quotient.high
+    assert quotient.high - quotient.low < 0.5
+    assert "or use the combinations" in found.constants["torque"].advice
+
+
+def test_combinations_that_are_none_are_not_advised() -> None:
+    log = record(Sum(), {"motor": 0.7, "hand": 0.4}, noise=(1e-3, UNSEEN), samples=400)
+    found = identify(make_task(Sum()), [log], IdentifyConfig(**PLAIN))
+    assert found.combinations == {}
+    for constant in found.constants.values():
+        assert constant.verdict.startswith("only in combination with ")
+        assert constant.advice.endswith("fix it with Constant(value, fixed=True).")
+
+
+def test_what_was_done_already_is_not_advised() -> None:
+    assert "let delay and lag be 'auto'." in late_advice(IdentifyConfig(**PLAIN), Actuator())
+    sought = late_advice(IdentifyConfig(), Actuator(delay_steps=1.0))
+    assert "auto" not in sought
+    assert "largest_delay" not in sought
+    assert "time stamps" in sought
+    longest = late_advice(IdentifyConfig(), Actuator(delay_steps=(0.0, 5.0)))
+    assert longest.endswith("slowly: allow a larger largest_delay than 5.")
 
 
 def test_a_velocity_in_other_units_is_named() -> None:

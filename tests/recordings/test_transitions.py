@@ -57,8 +57,43 @@ def test_a_command_beyond_the_bounds_is_left_out(caplog: pytest.LogCaptureFixtur
         data = transitions(PENDULUM, [recording(action=action)])
     assert data["action"].flatten().tolist() == [0.0, 2.0, 0.0, 0.0]
     assert "1 recorded transitions are left out: their commands are beyond" in caplog.text
-    with pytest.raises(ConfigError, match="no transition can be used"):
+    assert "check the unit and scale of the column, or widen" in caplog.text
+
+
+def test_a_log_most_of_whose_commands_are_beyond_the_bounds_is_refused() -> None:
+    wrong = recording(action=torch.tensor([[0.0], [-1500.0], [900.0], [1.5], [2000.0], [0.0]]))
+    expected = (
+        r"3 of 5 transitions would be left out: .* beyond the bounds of task 'pendulum', "
+        r"\(-2.0,\) to \(2.0,\); check the unit and scale.*, or widen.* torque from -1500 to 2000"
+    )
+    with pytest.raises(ConfigError, match=expected):
+        transitions(PENDULUM, [wrong])
+    # Another log, all of whose commands are good, makes it a minority.
+    assert len(transitions(PENDULUM, [wrong, recording()])) == 2 + 5
+    with pytest.raises(ConfigError, match="5 of 5 transitions"):
         transitions(PENDULUM, [recording(action=torch.full((6, 1), 9.0))])
+
+
+def test_states_that_are_unknown_count_neither_way() -> None:
+    state = torch.randn(9, 2)
+    state[4:] = torch.nan
+    action = torch.tensor([9.0, 9.0, 0.5, 9.0, *[0.5] * 5])[:, None]
+    with pytest.raises(ConfigError, match="2 of 3 transitions"):
+        transitions(PENDULUM, [recording(9, state=state, action=action)])
+    state[::2] = torch.nan
+    with pytest.raises(ConfigError, match="no transition can be used"):
+        transitions(PENDULUM, [recording(9, state=state, action=9.0 * action)])
+
+
+def test_a_log_most_of_whose_commands_change_too_fast_is_refused() -> None:
+    slow = replace(PENDULUM, action_rate_limit=1.0)
+    expected = (
+        r"4 of 5 transitions .* faster than the action_rate_limit .* check the unit.*"
+        r"by up to 40 a second"
+    )
+    jumps = torch.tensor([0.0, 1.0, -1.0, 1.0, -1.0, 1.0])[:, None]
+    with pytest.raises(ConfigError, match=expected):
+        transitions(slow, [recording(action=jumps)])
 
 
 def test_the_task_says_where_an_episode_ends() -> None:
