@@ -180,4 +180,4 @@ class ActorModule(ExportModule):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the actor's action, ``[m]``."""
-        return self.network(observation)
+        return self.network(observation[None])[0]  # Inductor cannot fuse a layer without a batch

@@ -14,7 +14,8 @@ from tensordict import TensorDict
 
 from phihp_torchrl import Agent, Constraint, get_task, save_agent
 from phihp_torchrl.agents import Actor, TwinQ
-from phihp_torchrl.commands import main
+from phihp_torchrl.commands import export, main
+from phihp_torchrl.commands.export import _available, _milliseconds
 from phihp_torchrl.deployment import (
     ActorModule,
     AgentError,
@@ -35,6 +36,7 @@ from tests.followed import AIM, followed
 
 from .agent_parts import make_agent as make_small_agent
 from .agent_parts import observations as observe
+from .compiled_c import CC
 
 TINY = CEMConfig(
     planning_horizon=2, optim_steps=2, num_candidates=8, top_k=2, num_policy_candidates=2
@@ -97,6 +99,14 @@ def test_onnx_without_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ImportError, match=r"phihp_torchrl\[onnx\]"):
         export_onnx(PlanModule(make_agent()), tmp_path / "plan.onnx")
+
+
+def test_what_is_not_installed_is_no_format_by_default(monkeypatch, capsys):
+    monkeypatch.setattr(
+        sys.modules["phihp_torchrl.commands.export"], "find_spec", lambda name: None
+    )
+    assert _available() == ("aoti", "c")
+    assert "phihp_torchrl[onnx]" in capsys.readouterr().out
 
 
 def test_differences_are_found():
@@ -177,14 +187,46 @@ def test_the_command_says_what_failed(tmp_path, monkeypatch, capsys):
     save_agent(make_agent(), tmp_path / "agent")
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     words = [f"agent={tmp_path / 'agent'}", f"out={tmp_path / 'out'}", "states=5"]
-    main([*words, "formats=[onnx,c]"], command="export")
+    with pytest.raises(SystemExit, match=r"^error: not written: plan\.onnx, actor\.onnx; "):
+        main([*words, "formats=[onnx,c]"], command="export")
     output = capsys.readouterr().out
     assert output.count("onnx: not written: ImportError") == 2
-    assert "| eager plan |" in output
+    assert "| eager plan |" not in output  # with which nothing would be compared
     assert "| eager actor |" in output
     assert (tmp_path / "out" / "actor.c").is_file()
-    main([*words, "format=c", "parts=[actor]"], command="export")
-    assert "plan" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("word", ["format=c", "format=[c]", "formats=[c]"])
+def test_the_command_writes_c_without_a_plan_and_says_so_as_it_goes(
+    tmp_path, monkeypatch, capsys, word
+):
+    save_agent(make_agent(), tmp_path / "agent")
+    words = [f"agent={tmp_path / 'agent'}", f"out={tmp_path / 'out'}", word]
+    monkeypatch.setattr(PlanModule, "forward", None)  # nothing may call it
+    timed, said = [], []
+
+    def milliseconds(act, module, observations):
+        said.append(capsys.readouterr().out)  # what is there when the first check begins
+        timed.append(found := _milliseconds(act, module, observations))
+        return found
+
+    monkeypatch.setattr(export, "_milliseconds", milliseconds)
+    main([*words, "states=60"], command="export")
+    first, last, _ = said[0].splitlines()
+    assert first == f"Writing actor.c to {tmp_path / 'out'}."
+    assert last == f"{tmp_path / 'out' / 'actor.c'}: written"
+    assert [len(each) for each in timed] == [50] * (1 if CC is None else 2)
+    output = capsys.readouterr().out
+    assert "plan" not in output
+    assert CC is None or "| 0 of 60 |" in output
+
+
+def test_the_command_refuses_a_format_that_no_part_has(tmp_path):
+    save_agent(make_agent(), tmp_path / "agent")
+    words = [f"agent={tmp_path / 'agent'}", f"out={tmp_path / 'out'}", "parts=[plan]"]
+    with pytest.raises(SystemExit, match=r"formats: .* got \['c'\]; c is for the actor alone"):
+        main([*words, "formats=[c]"], command="export")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
