@@ -43,7 +43,7 @@ from phihp_torchrl.config.durations import (
     resolve_seconds,
     steps_in,
 )
-from phihp_torchrl.config.errors import ConfigError
+from phihp_torchrl.config.errors import ConfigError, meant
 from phihp_torchrl.config.help import help_text, sentences, sentences_of, settings_text
 from phihp_torchrl.config.methods import METHODS, Method, get_method, register_method
 from phihp_torchrl.config.modules import import_named

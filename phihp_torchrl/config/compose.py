@@ -26,7 +26,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from phihp_torchrl.config.choices import choices_of, groups, offered, published_offers
-from phihp_torchrl.config.errors import ConfigError
+from phihp_torchrl.config.errors import ConfigError, meant
 from phihp_torchrl.config.methods import METHODS
 from phihp_torchrl.config.typed import flatten
 
@@ -151,7 +151,8 @@ def _explain(
         if group in lines and not lines[group].is_sweep_override():
             chosen, known = str(lines[group].value()), choices_of(group, config_dir)
             if chosen not in known:
-                return ConfigError(group, f"expected one of {known}, got {chosen!r}.")
+                hint = meant(chosen, known)
+                return ConfigError(group, f"expected one of {known}, got {chosen!r}{hint}")
     choices = [word for word in overrides if word.split("=", 1)[0] in _GROUPS]
     if len(choices) < len(overrides):  # otherwise a choice is wrong and not a key
         composed: Any = OmegaConf.to_container(compose_yaml(choices, config_dir))

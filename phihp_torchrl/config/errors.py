@@ -1,6 +1,9 @@
-"""The error that every wrong setting raises, with its key and what was expected."""
+"""The error that every wrong setting raises, with its key, what was expected and what was meant."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class ConfigError(ValueError):
@@ -27,6 +30,19 @@ class ConfigError(ValueError):
     def inside(self, path: str) -> ConfigError:
         """Return the same error with the section ``path`` before its key."""
         return ConfigError(f"{path}.{self.key}" if path else self.key, self.reason)
+
+
+def meant(name: object, names: Iterable[str]) -> str:
+    """How a message about an unknown name ends: with the name that may have been meant, if any.
+
+    Examples:
+        >>> meant("pendulun", ["acrobot", "pendulum"])
+        "; did you mean 'pendulum'?"
+        >>> meant("zzz", ["acrobot", "pendulum"])
+        '.'
+    """
+    close = get_close_matches(str(name), list(names), n=1)
+    return f"; did you mean {close[0]!r}?" if close else "."
 
 
 ConfigError.__module__ = "phihp_torchrl.config"  # the name that tracebacks show

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from difflib import get_close_matches
 from typing import TypeVar
 
-from phihp_torchrl.config.errors import ConfigError
+from phihp_torchrl.config.errors import ConfigError, meant
 
 T = TypeVar("T")
 
@@ -51,8 +50,7 @@ class Registry(Mapping[str, T]):
             ConfigError: if there is none; the message lists the registered names.
         """
         if name not in self:
-            close = get_close_matches(str(name), self._entries, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else "."
+            hint = meant(name, self)
             raise ConfigError(self.what, f"expected one of {sorted(self)}, got {name!r}{hint}")
         return self._entries[name]
 

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from typing import Any, TypeVar
 
 from phihp_torchrl.config.convert import convert, hints_of, join
-from phihp_torchrl.config.errors import ConfigError
+from phihp_torchrl.config.errors import ConfigError, meant
 from phihp_torchrl.config.registry import Registry
 
 T = TypeVar("T")
@@ -88,7 +88,8 @@ def read_kind(kinds: Registry[Any], mapping: Mapping[str, Any], path: str) -> An
     rest = dict(mapping)
     name = rest.pop(KIND, None) or next(iter(kinds))
     if name not in kinds:
-        raise ConfigError(join(path, KIND), f"expected one of {sorted(kinds)}, got {name!r}.")
+        reason = f"expected one of {sorted(kinds)}, got {name!r}{meant(name, kinds)}"
+        raise ConfigError(join(path, KIND), reason)
     return from_mapping(kinds[name].config, rest, path)
 
 

@@ -8,6 +8,7 @@ from phihp_torchrl.systems.base import Constant, Constants, System, override, wr
 from phihp_torchrl.systems.cart_double_pendulum import CartDoublePendulum
 from phihp_torchrl.systems.cartpole import CartPole, accelerations
 from phihp_torchrl.systems.lagrangian import LagrangianSystem
+from phihp_torchrl.systems.names import check_names
 from phihp_torchrl.systems.pendulum import Pendulum
 from phihp_torchrl.systems.two_link_arm import TwoLinkArm
 

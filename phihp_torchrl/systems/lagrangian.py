@@ -17,6 +17,7 @@ from phihp_torchrl.systems.derivation import (
     make_equations,
     make_symbols,
 )
+from phihp_torchrl.systems.names import check_names
 from phihp_torchrl.systems.solve import solve_positive
 
 Symbols = tuple[sympy.Expr, ...]
@@ -74,6 +75,7 @@ class LagrangianSystem(System):
 
     def __init__(self, constants: Mapping[str, float] | None = None) -> None:
         super().__init__(constants)
+        check_names(self)
         self.equations = make_equations(self._mechanics())
         self._check_mass()
 

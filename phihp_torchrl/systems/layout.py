@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.integrators import StateLayout
+from phihp_torchrl.systems.names import check_names
 
 if TYPE_CHECKING:
     from phihp_torchrl.systems.base import System
@@ -20,6 +21,7 @@ def make_layout(
     restitution: float | Mapping[str, float],
 ) -> StateLayout:
     """Return the layout of a system's state; :meth:`System.layout` says what the limits are."""
+    check_names(system)
     positions, velocities = list(system.velocity_of), list(system.velocity_of.values())
     _check_names("velocity_limits", velocity_limits, velocities)
     _check_names("position_limits", position_limits, positions)

@@ -16,7 +16,7 @@ from phihp_torchrl.config import (
     from_mapping,
 )
 from phihp_torchrl.integrators import StateLayout
-from phihp_torchrl.systems import System
+from phihp_torchrl.systems import System, check_names
 from phihp_torchrl.tasks.actuator import Actuator
 from phihp_torchrl.tasks.actuator_part import ActuatorPart
 from phihp_torchrl.tasks.bounds import read_limits
@@ -138,6 +138,7 @@ class Task(Steps):
         check_fields(self)
         if not isinstance(self.system, System):
             raise ConfigError("system", f"expected a System, got {self.system!r}.")
+        check_names(self.system)
         self._set_bounds()
         check_positive(self, "time_step")
         check_count(self, "max_steps")

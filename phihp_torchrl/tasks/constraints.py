@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from phihp_torchrl.config import ConfigError
+from phihp_torchrl.config import ConfigError, meant
 from phihp_torchrl.systems import System, wrap
 from phihp_torchrl.tasks.box import Box
 from phihp_torchrl.tasks.constraint import Constraint
@@ -75,7 +75,8 @@ class Constraints:
             numbers: by name, ``low``, ``high``, ``price`` and ``hard`` as far as they differ.
 
         Raises:
-            ConfigError: for a key or a value that is none of a constraint's; it names the key.
+            ConfigError: for a name that is no constraint's and no state's, and for a key or a value
+                that is none of a constraint's; it names the key.
 
         Examples:
             >>> from phihp_torchrl import get_task
@@ -84,7 +85,15 @@ class Constraints:
             1.0
         """
         found = {constraint.name: constraint for constraint in self.each}
+        states = self._system.state_names
         for name, changes in numbers.items():
+            if name not in found and name not in states:
+                known = list(dict.fromkeys([*found, *states]))
+                raise ConfigError(
+                    f"constraints.{name}",
+                    f"unknown name, expected one of the task's constraints {list(found)} or of the "
+                    f"states {list(states)}{meant(name, known)}",
+                )
             if changes is None:
                 if found.pop(name, None) is None:
                     raise ConfigError(
@@ -160,7 +169,8 @@ class Constraints:
         if name not in system.state_names:
             raise ConfigError(
                 f"constraints.{name}",
-                f"expected one of the states {system.state_names}, or a function.",
+                f"expected one of the states {system.state_names}, or a function"
+                f"{meant(name, system.state_names)}",
             )
         if name in system.angles:
             limits = [v for v in (constraint.low, constraint.high) if v is not None]

@@ -296,6 +296,10 @@ def test_a_section_without_a_kind_is_of_the_first() -> None:
     ("section", "message"),
     [
         ({"kind": "green"}, "wall.hue.kind: expected one of ['blue', 'red'], got 'green'."),
+        (
+            {"kind": "bleu"},
+            "wall.hue.kind: expected one of ['blue', 'red'], got 'bleu'; did you mean 'blue'?",
+        ),
         ({"kind": "red", "tint": "sky"}, "wall.hue.tint: unknown key"),
         ({"tint": "sky"}, "wall.hue.tint: unknown key"),
         ({"kind": "blue", "tint": 3}, "wall.hue.tint: expected a text, got 3."),

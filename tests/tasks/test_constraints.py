@@ -195,6 +195,28 @@ def test_what_is_wrong_is_refused_by_name(make, key):
     assert error.value.key == key
 
 
+def test_settings_of_an_unknown_constraint_tell_the_known_ones():
+    known = (
+        r"expected one of the task's constraints \['x', 'power'\] or of the states "
+        r"\['x', 'x_dot', 'theta', 'theta_dot'\]"
+    )
+    task = limited(NEAR, POWER)
+    for name, changes, hint in (
+        ("powr", {"price": 5.0}, r"; did you mean 'power'\?"),
+        ("thta", {"high": 1.0, "price": 5.0}, r"; did you mean 'theta'\?"),
+        ("zzz", {"price": 5.0}, r"\."),
+        ("powr", None, r"; did you mean 'power'\?"),
+    ):
+        with pytest.raises(
+            ConfigError, match=rf"^constraints\.{name}: unknown name, {known}{hint}$"
+        ):
+            task.with_constraints({name: changes})
+    assert task.with_constraints({"power": {"price": 5.0}}).constraints[1].price == 5.0
+    assert task.with_constraints({"x_dot": {"high": 1.0, "price": 5.0}}).limits.names[2] == "x_dot"
+    with pytest.raises(ConfigError, match=r"or a function; did you mean 'theta'\?$"):
+        limited(Constraint("thta", high=1.0, price=1.0))
+
+
 @pytest.mark.parametrize(
     "function",
     [
