@@ -145,7 +145,7 @@ def _load(config: PlayConfig) -> dict[str, Agent]:
 def _world(config: PlayConfig, agent: Agent) -> World:
     """The world that is asked for, or else the one in which the agent was trained."""
     from phihp_torchrl.trainers import named_code
-    from phihp_torchrl.worlds import make_world
+    from phihp_torchrl.worlds import has_env, make_world
 
     trained_in = (agent.metadata.get("config") or {}).get("world")
     named = {} if config.world else named_code({"world": trained_in})
@@ -160,12 +160,24 @@ def _world(config: PlayConfig, agent: Agent) -> World:
             "line or say trust=true.",
         )
     world = config.world or trained_in or "simulated"
+    if not has_env(world):  # before its files are read
+        whose = "" if config.world else ", in which the agent was trained"
+        raise ConfigError(
+            "world",
+            f"expected one to act in, got recordings alone{whose}. Name another one: "
+            "world=simulated has the task's equations with its first guesses of the constants.",
+        )
     return make_world(agent.task, world)
 
 
 def _play(agent: Agent, world: World, config: PlayConfig) -> dict[str, Any]:
     """Returns and latency of one agent."""
-    from phihp_torchrl.evaluation import evaluate, evaluation_seed, measure_latency
+    from phihp_torchrl.evaluation import (
+        evaluate,
+        evaluation_seed,
+        measure_latency,
+        warn_of_slow_plans,
+    )
 
     seed = evaluation_seed(config.seed)
     played = evaluate(
@@ -181,4 +193,5 @@ def _play(agent: Agent, world: World, config: PlayConfig) -> dict[str, Any]:
     if config.latency_actions:
         latency = measure_latency(agent, agent.task, calls=config.latency_actions, seed=seed)
         result |= latency.summary()
+        warn_of_slow_plans(agent, result["latency_ms_p50"])
     return result

@@ -18,6 +18,7 @@ from phihp_torchrl.deployment.package import PACKAGE_FILE, place_package
 from phihp_torchrl.deployment.reading import AgentError
 from phihp_torchrl.deployment.realtime import RealTimeReport, run_realtime
 from phihp_torchrl.deployment.safety import Safety
+from phihp_torchrl.deployment.saved_task import describe_task
 from phihp_torchrl.deployment.socket_plant import simulated_plant
 from phihp_torchrl.deployment.warm_up import WarmUp
 

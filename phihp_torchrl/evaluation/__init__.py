@@ -17,6 +17,7 @@ from phihp_torchrl.evaluation.seeds import (
     evaluation_seed,
 )
 from phihp_torchrl.evaluation.show import show_episode
+from phihp_torchrl.evaluation.slow_plans import warn_of_slow_plans
 from phihp_torchrl.evaluation.table import TaskResult, markdown_table, mean_and_std, returns_table
 from phihp_torchrl.evaluation.video import write_gif
 from phihp_torchrl.evaluation.violations import Violations

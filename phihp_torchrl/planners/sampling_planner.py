@@ -253,6 +253,11 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
         long = self.settings.planning_horizon >= LONG_PLAN and self._action_low.device.type == "cpu"
         return Problem(model=model, bounds=bounds, actor=actor, value=value, in_loop=long)
 
+    @property
+    def compiles(self) -> bool:
+        """Whether plans are compiled at their first call."""
+        return self._compiles
+
     def why_not_compiled(self) -> str | None:
         """Return the reason why the plan cannot be compiled, or ``None``."""
         if not self.uses_tensors:

@@ -22,6 +22,7 @@ from phihp_torchrl.evaluation import (
     measure_latency,
     play_baselines,
     show_episode,
+    warn_of_slow_plans,
 )
 from phihp_torchrl.trainers.collect import CollectConfig
 from phihp_torchrl.trainers.context import Context
@@ -229,7 +230,9 @@ class EvaluatePhase:
     def _latency(self, agent: Agent) -> dict[str, float]:
         if not (calls := self.settings.latency_actions):
             return {}
-        return measure_latency(agent, self.agent.task, calls=calls).summary()
+        summary = measure_latency(agent, self.agent.task, calls=calls).summary()
+        warn_of_slow_plans(agent, summary["latency_ms_p50"])
+        return summary
 
     def _take_package(self) -> dict[str, float]:
         """Wait for the package, and put it beside the agent."""

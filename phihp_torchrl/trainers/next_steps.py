@@ -10,8 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from phihp_torchrl.config import get_method, override_lines
+from phihp_torchrl.config import ConfigError, get_method, override_lines
+from phihp_torchrl.trainers.changed_settings import settings_of
 from phihp_torchrl.trainers.run_directory import RunDirectory
+from phihp_torchrl.worlds import GivenConfig, has_env
 
 
 def program() -> list[str]:
@@ -45,10 +47,16 @@ def next_steps(path: Path) -> list[tuple[str, str]]:
         return _later_phases(directory)
     config = directory.read_config() if directory.config.is_file() else {}
     agent = {"agent": str(directory.agent), **_plugins(config)}
-    return [
-        ("play it in more episodes", _command(["evaluate"], {**agent, "episodes": 200})),
-        ("write it as one file for another machine", _command(["export"], agent)),
-    ]
+    steps = []
+    if _is_played(config.get("world", "simulated")):
+        play = _command(["evaluate"], {**agent, "episodes": 200})
+        steps.append(("play it in more episodes", play))
+    return [*steps, ("write it as one file for another machine", _command(["export"], agent))]
+
+
+def _is_played(world: Any) -> bool:
+    """Whether a command can play in the world of these settings; a Python object is not there."""
+    return _kind(world) != GivenConfig.kind and has_env(world)
 
 
 def _later_phases(directory: RunDirectory) -> list[tuple[str, str]]:
@@ -64,10 +72,33 @@ def _later_phases(directory: RunDirectory) -> list[tuple[str, str]]:
     ]
     if not left or len(left) == len(names):
         return []
+    if _kind(config.get("world")) == GivenConfig.kind:
+        return []  # no command has the world
+    place = _config_dir(directory)
     settings = {"task": config["task"], "method": config.get("method", "phihp")}
     settings |= {"phases": left, "from": str(directory.path), **_plugins(config)}
-    command = _command(["train"], settings)
-    return [("go on to the phases that are left", command)]
+    settings |= settings_of(config, place)
+    words = ["train", *([] if place is None else ["--config-dir", place])]
+    return [("go on to the phases that are left", _command(words, settings))]
+
+
+def _kind(world: Any) -> Any:
+    return world.get("kind") if isinstance(world, Mapping) else world
+
+
+def _config_dir(directory: RunDirectory) -> str | None:
+    """The directory of ``--config-dir`` that a run was started with, as far as it is recorded."""
+    try:
+        sessions = directory.read_metadata().get("sessions") or [{}]
+    except ConfigError:
+        return None
+    words = iter(sessions[0].get("command") or ())
+    for word in words:
+        name, _, value = word.partition("=")
+        if name in ("--config-dir", "-cd"):
+            place = value or next(words, "")
+            return place if place and Path(place).is_dir() else None
+    return None
 
 
 def _plugins(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import torch
 from phihp_torchrl.config import ConfigError, names_file
 from phihp_torchrl.deployment import plain_defaults
 from phihp_torchrl.display import Progress
+from phihp_torchrl.trainers.earlier import check_earlier
 from phihp_torchrl.trainers.expected import expect
 from phihp_torchrl.trainers.files import check_contained
 from phihp_torchrl.trainers.interrupt import Interrupt
@@ -103,11 +104,12 @@ def run(
         check_same(config, directory)
         check_contained(directory.path)
     else:
+        check_earlier(config, world.task)
         rehearse(config, world)
         config, directory = new_directory(config, path)
     with _told(directory), RunLock(directory.path):
         if not resume:
-            begin(config, directory)
+            begin(config, directory, world.task)
         expected = expect(config, directory.path)
         progress = Progress(expected.middle, enabled=config.progress)
         with Interrupt() as interrupt, progress, Warned() as warned:

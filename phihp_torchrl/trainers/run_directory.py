@@ -30,7 +30,7 @@ class RunDirectory:
     ========================= =====================================================================
     ``config.yaml``           the whole configuration
     ``metadata.json``         seed, commit, command, machine, versions, seconds of each phase,
-                              and the settings and code that the run was started with
+                              and settings, task and code that the run was started with
     ``metrics.csv``           a row for each unit of work
     ``checkpoints/``          the latest states of the current phase
     ``phases/<phase>/``       the final state of each finished phase

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from phihp_torchrl.config import ConfigError, differences, digest_of_values, get_method
+from phihp_torchrl.tasks import Task
 from phihp_torchrl.trainers.checkpoints import load_state
+from phihp_torchrl.trainers.earlier import TASK, describe
 from phihp_torchrl.trainers.files import STAGE, check_contained, remove_stages
 from phihp_torchrl.trainers.lock import LOCK, OWNER, RunLock
 from phihp_torchrl.trainers.next_steps import resume_command
@@ -48,16 +50,22 @@ def new_directory(config: RunConfig, path: str | Path | None) -> tuple[RunConfig
     return config, directory
 
 
-def begin(config: RunConfig, directory: RunDirectory) -> None:
+def begin(config: RunConfig, directory: RunDirectory, task: Task) -> None:
     """Write the first files of a new run, and copy the phases that another run has done.
 
     ``config.yaml`` comes last: a directory without it holds nothing that would be lost.
+
+    Args:
+        config: settings of the run.
+        directory: its directory.
+        task: its task, which the metadata describe.
     """
     _check_free(directory)
     remove_stages(directory.path)
     settings = config.to_mapping()
     code = sign(settings)
-    directory.write_metadata({"config": settings, **({} if code is None else {"code": code})})
+    signed = {} if code is None else {"code": code}
+    directory.write_metadata({"config": settings, TASK: describe(task), **signed})
     if config.start_from is not None:
         shutil.rmtree(directory.path / "phases", ignore_errors=True)
         source = RunDirectory(config.start_from)

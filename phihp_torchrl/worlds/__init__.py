@@ -17,6 +17,7 @@ from phihp_torchrl.worlds.registry import (
     WORLDS,
     GivenConfig,
     WorldKind,
+    has_env,
     make_world,
     register_world,
 )

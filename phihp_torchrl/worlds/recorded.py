@@ -45,6 +45,7 @@ class RecordedConfig:
     """
 
     kind: ClassVar[str] = "recorded"
+    has_env: ClassVar[bool] = False
 
     files: str | tuple[str, ...]
     columns: Mapping[str, Any] = field(default_factory=dict, hash=False)

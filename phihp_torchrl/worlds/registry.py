@@ -123,6 +123,21 @@ def make_world(task: str | Task, world: Any = "simulated") -> World:
     )
 
 
+def has_env(world: Any) -> bool:
+    """Whether one can act in the world that settings describe; asked before it is made.
+
+    Args:
+        world: the name of a kind of world, or settings as :func:`make_world` takes them.
+
+    Examples:
+        >>> has_env("simulated"), has_env({"kind": "recorded", "files": "logs/*.csv"})
+        (True, False)
+    """
+    name = world.get("kind") if isinstance(world, Mapping) else world
+    kind = WORLDS.get(name) if isinstance(name, str) else None
+    return bool(getattr(world if kind is None else kind.config, "has_env", True))
+
+
 def _are_recordings(world: Any) -> bool:
     listed = isinstance(world, (list, tuple)) and bool(world)
     return listed and all(isinstance(each, Recording) for each in world)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -67,6 +68,49 @@ def test_logs_whose_columns_the_task_names(
     agent = load_agent(place / "run" / "agent", task=get_task("rig"))
     assert agent.actor is not None
     phihp("train", "resume=run")  # the configuration knows all that it needs
+
+
+@pytest.mark.usefixtures("rig")
+def test_nobody_plays_in_logs_and_they_are_not_read_for_that(
+    phihp: Command,
+    place: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    phihp("train", *WORDS, "world.files=logs/*.csv", "run_dir=run", *FAST)
+    out = capsys.readouterr().out
+    assert "phihp evaluate" not in out
+    assert "export agent=run/agent" in out
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the files were read")
+
+    monkeypatch.setattr("phihp_torchrl.worlds.recorded.read_recordings", refuse)
+    words = ("evaluate", "agent=run/agent", "plugins=[my_rig.py]", "episodes=1", "video=false")
+    with pytest.raises(SystemExit, match=r"^error: world: .*in which the agent was trained"):
+        phihp(*words)
+    with pytest.raises(SystemExit, match=r"^error: world: expected one to act in, got recordings"):
+        phihp(*words, "world=recorded", "world.files=logs/*.csv")
+    phihp(*words, "world=simulated", "baselines=none", "latency_actions=0")
+
+
+@pytest.mark.usefixtures("rig")
+def test_the_phases_that_are_left_are_done_by_the_command_that_is_printed(
+    phihp: Command, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ("world.files=logs/*.csv", "actuator.delay_steps=1", "action_rate_cost=0.1")
+    phihp("train", *WORDS, *settings, "run_dir=run", "phases=[model]", *FAST)
+    (line,) = [ln for ln in capsys.readouterr().out.splitlines() if " train " in ln]
+    pasted = shlex.split(line.partition(" train ")[2])
+    phihp("train", *pasted, "run_dir=after")
+    first, after = (
+        yaml.safe_load((place / name / "config.yaml").read_text()) for name in ("run", "after")
+    )
+    own = ("phases", "from")
+    assert {k: v for k, v in after.items() if k not in own} == {
+        k: v for k, v in first.items() if k not in own
+    }
+    assert (place / "after" / "agent").is_dir()
 
 
 @pytest.mark.usefixtures("rig")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,14 +14,14 @@ from pages import foreign, read
 from tensordict import TensorDict
 
 from phihp_torchrl.commands import tell
-from phihp_torchrl.config import load_config
+from phihp_torchrl.config import compose_yaml, load_config
 from phihp_torchrl.tasks import get_task
 from phihp_torchrl.trainers import RunResult, next_steps
 from phihp_torchrl.trainers.expected import expect
 from phihp_torchrl.trainers.real_data import collected_return
 from phihp_torchrl.trainers.report import report_run, true_constants, write_report
 from phihp_torchrl.trainers.run_directory import RunDirectory
-from phihp_torchrl.trainers.run_request import read_run_config
+from phihp_torchrl.trainers.run_request import read_request, read_run_config
 from phihp_torchrl.worlds import make_world
 
 from .run_parts import CONFIG
@@ -131,6 +132,67 @@ def test_commands_name_the_plugins_of_the_run(copied: Path) -> None:
         shutil.rmtree(copied / name)
     ((_, command),) = next_steps(copied)
     assert "plugins=[my_task.py,rig]" in command
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("task=pendulum", "actuator.delay_steps=1", "action_rate_limit=20", "seed=3"),
+        ("task=acrobot", "preset=paper", "planner=mppi", "logger=tensorboard", "logger.tags=[a b]"),
+        ("task=pendulum", "constraints={theta_dot:{high:6.0}}", "compile=false", "budget=fast"),
+        ("task=pendulum", "world.friction={joint:0.1}", "policy.td3.gamma='2 s'"),
+        ("task=pendulum", "world=gymnasium", "world.id=Pendulum-v1", "world.options={g: 9.0}"),
+        ("task=pendulum", "world=recorded", "world.files=[a/*.csv, b.csv]",
+         "world.columns={theta: {column: angle, unit: deg}}", "calibrate.enabled=false"),
+    ],
+)  # fmt: skip
+def test_the_phases_that_are_left_have_the_settings_of_the_run(
+    words: tuple[str, ...], tmp_path: Path
+) -> None:
+    words = (*words, "phases=[model]")
+    before = read_request(compose_yaml(words), words).config
+    directory = RunDirectory(tmp_path / "run")
+    directory.phase("model").mkdir(parents=True)
+    directory.write_config(before.to_mapping())
+    ((_, command),) = next_steps(directory.path)
+    _, pasted = command.split(" train ")
+    later = shlex.split(pasted)
+    assert not [word for word in later if word.startswith(("run_dir", "model."))]
+    after = read_request(compose_yaml(later), later).config
+    assert after.phases_before == ("model",)
+    assert replace(after, phases=before.phases, start_from=None) == before
+
+
+def test_the_phases_that_are_left_have_the_folder_of_settings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    place = tmp_path / "conf" / "task" / "brief-pendulum.yaml"
+    place.parent.mkdir(parents=True)
+    place.write_text("# @package _global_\ntask: brief-pendulum\npresets: {default: {seed: 4}}\n")
+    settings = load_config("brief-pendulum", overrides=["threads=2"], config_dir="conf")
+    directory = RunDirectory("run")
+    directory.phase("model").mkdir(parents=True)
+    directory.write_config(read_run_config(settings).to_mapping())
+    for command in (["phihp", "train", "--config-dir", "conf"], ["phihp", "--config-dir=conf"]):
+        directory.write_metadata({"sessions": [{"command": command}]})
+        ((_, pasted),) = next_steps(directory.path)
+        assert " train --config-dir conf task=brief-pendulum " in pasted
+        assert "threads=2" in pasted
+        assert "seed=" not in pasted
+    shutil.rmtree("conf")
+    ((_, pasted),) = next_steps(directory.path)  # nothing is known of the task's own settings
+    assert "config-dir" not in pasted
+    assert "seed=4" in pasted
+
+
+def test_a_world_in_which_no_command_can_act_is_not_played_in(copied: Path) -> None:
+    directory = RunDirectory(copied)
+    settings = directory.read_config()
+    for world in ({"kind": "recorded", "files": "a.csv"}, {"kind": "given"}):
+        directory.write_config({**settings, "world": world})
+        ((_, command),) = next_steps(copied)
+        assert " export " in command
 
 
 def test_commands_are_quoted(copied: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import logging
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -176,7 +177,7 @@ def test_plans_are_compiled_where_they_are_made_one_at_a_time(
 
     def timed(acting: Any, *_: Any, **__: Any) -> Any:
         compiled.append(acting.planner._compiles)
-        return SimpleNamespace(summary=dict)
+        return SimpleNamespace(summary=lambda: {"latency_ms_p50": 1.0})
 
     module = import_module("phihp_torchrl.trainers.evaluate")
     monkeypatch.setattr(module, "evaluate", played)
@@ -216,6 +217,24 @@ def test_a_package_of_the_plan_lies_beside_the_agent(
     results = json.loads((place / "evaluation.json").read_text())["planner"]
     assert (results["packaged"], results["latency_ms_p50"]) == (compiles, 1.0)
     assert (place / "agent" / PACKAGE_FILE).is_file() is compiles
+
+
+def test_plans_slower_than_a_time_step_are_told_once(
+    whole: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def timed(agent: Agent, *_: Any, **__: Any) -> Any:
+        times = {"latency_ms_mean": 51.0, "latency_ms_p50": 51.0}
+        return SimpleNamespace(summary=lambda: times)
+
+    monkeypatch.setattr(import_module("phihp_torchrl.trainers.evaluate"), "measure_latency", timed)
+    config = with_sections(CONFIG, evaluate=replace(EVALUATE, latency_actions=2))
+    config = replace(config, phases=("evaluate",), start_from=str(whole))
+    with caplog.at_level(logging.WARNING):
+        assert run(config, tmp_path / "run").finished
+    assert caplog.text.count("A plan takes 51 ms, and the time step is 50 ms") == 1
 
 
 def test_a_short_run_earns_no_package(whole: Path) -> None:
