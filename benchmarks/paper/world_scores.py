@@ -112,10 +112,39 @@ def write_report(results: Path, names: Sequence[str]) -> None:
         draw(results / "scores.png", panels, mine, others)
         text += "\n![returns by environment steps](scores.png)\n"
     if runs:
-        commits = sorted({commit_text(run["origin"]) for run in runs})
-        machines = sorted({machine_text(run["origin"]) for run in runs})
-        text += f"\nCommits: {', '.join(commits)}. Machines: {'; '.join(machines)}.\n"
+        text += f"\n{_origins(runs)}\n"
     (results / "README.md").write_text(text)
+
+
+def brief(results: Path, names: Sequence[str]) -> str:
+    """What somebody new wants to know first, for README.md: the tasks that others have played too.
+
+    Args:
+        results: the folder with a JSON file for each run, and the published scores.
+        names: tasks, in the order of the table.
+    """
+    runs = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
+    others = published(results)
+    rows, used = [], []
+    for mine in ours(runs, names):
+        theirs = {s.method: s for s in reversed(others) if s.task == mine.task}  # of fewest steps
+        if mine.method == PLAYERS["planner"] and theirs:
+            used += [run for run in runs if run["task"] == mine.task]
+            spread = f"{mine.mean:.0f} ({mine.lowest:.0f} to {mine.highest:.0f})"
+            row = [mine.task, str(mine.seeds), f"{mine.steps:,}", spread]
+            rows.append([*row, *(_of(theirs.get(method)) for method in _COLORS)])
+    header = ["task", "seeds", "environment steps", "return (seeds from … to)", *_COLORS]
+    return f"{markdown_table(header, rows)}\n{_origins(used)}"
+
+
+def _of(score: Score | None) -> str:
+    return "–" if score is None else f"{score.mean:.0f} ({score.steps:,})"
+
+
+def _origins(runs: Sequence[Mapping[str, Any]]) -> str:
+    commits = sorted({commit_text(run["origin"]) for run in runs})
+    machines = sorted({machine_text(run["origin"]) for run in runs})
+    return f"Commits: {', '.join(commits)}. Machines: {'; '.join(machines)}."
 
 
 _INTRODUCTION = """# Whole runs in worlds that others made

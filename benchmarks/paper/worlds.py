@@ -27,9 +27,11 @@ from phihp_torchrl.config import kind_mapping
 from phihp_torchrl.tasks import list_tasks, register_task
 from phihp_torchrl.trainers import RunDirectory, read_run_config
 from phihp_torchrl.worlds import EnvWorld, GivenConfig
-from world_scores import write_report
+from report.overview import put_between
+from world_scores import brief, write_report
 
 RESULTS, RUNS = Path("results/worlds"), Path("outputs/worlds")
+START, END = "<!-- worlds:start -->", "<!-- worlds:end -->"
 EPISODES = 20
 
 
@@ -136,6 +138,8 @@ def main() -> None:
             file.write_text(json.dumps(found, indent=1) + "\n")
             write_report(arguments.results, list(ENTRIES))
     write_report(arguments.results, list(ENTRIES))
+    if arguments.results == RESULTS:  # and not others' runs
+        put_between(Path("README.md"), START, END, brief(RESULTS, list(ENTRIES)))
 
 
 if __name__ == "__main__":

@@ -85,6 +85,9 @@ def test_the_table_has_means_over_seeds_beside_the_scores_of_others(tmp_path):
     assert "| PhIHP, the actor alone | 2,000 | 730.0 | 680.0 to 780.0 | 2 | 800 |" in text
     assert "| pendulum-swingup | SAC | 100,000 | 50.0 | 0.0 to 100.0 | 3 |  |" in text
     assert "Not run yet: acrobot-swingup." in text
+    short = world_scores.brief(tmp_path, ["pendulum-swingup", "acrobot-swingup"])
+    assert "| pendulum-swingup | 2 | 2,000 | 750 (700 to 800) | – | – | 50 (100,000) |" in short
+    assert "acrobot" not in short
     assert (tmp_path / "scores.png").stat().st_size > 1000
 
 
