@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from phihp_torchrl.trainers import RunConfig, RunResult, register_phase, run
     from phihp_torchrl.worlds import Plant, World, make_world, register_plant, register_world
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 _HOMES = {
     "commands": ("Learned", "learn"),
