@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -117,7 +119,7 @@ def play_episode(
     frame_steps = _frame_steps(task, frames_per_second)
     world = SimulatedWorld(task) if world is None else world
     if render:
-        _check_pygame(world)
+        _prepare_pygame(world)
     env = world.make_env(render=render)
     frames: list[Any] = []
     with torch.random.fork_rng(devices=[]), torch.no_grad():
@@ -181,7 +183,7 @@ def draw_episode(
         >>> draw_episode(episode, SimulatedWorld(task)).frames.shape
         (6, 500, 500, 3)
     """
-    _check_pygame(world)
+    _prepare_pygame(world)
     frame_steps = _frame_steps(episode.task, frames_per_second)
     shown = range(0, len(episode.states), frame_steps)[:max_frames]
     env = world.make_env(render=True)
@@ -209,9 +211,17 @@ def _picture(world: World, env: EnvBase) -> NDArray[Any]:
     return picture
 
 
-def _check_pygame(world: World) -> None:
-    if isinstance(world, SimulatedWorld) and importlib.util.find_spec("pygame") is None:
+def _prepare_pygame(world: World) -> None:
+    """Refuse to draw without pygame, which without a display is told that there is none.
+
+    It would print an error about that otherwise, although its pictures need no display.
+    """
+    if not isinstance(world, SimulatedWorld):
+        return
+    if importlib.util.find_spec("pygame") is None:
         raise ImportError(
             "pygame: expected it to draw pictures, it is not installed; "
             "`pip install 'phihp_torchrl[rendering]'` brings it."
         )
+    if sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))):
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")

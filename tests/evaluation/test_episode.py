@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +14,7 @@ import torch
 
 from phihp_torchrl import get_task
 from phihp_torchrl.evaluation import evaluate, evaluation_seed, play_episode
-from phihp_torchrl.evaluation.episode import draw_episode
+from phihp_torchrl.evaluation.episode import _prepare_pygame, draw_episode
 from phihp_torchrl.worlds import (
     EnvWorld,
     GymnasiumConfig,
@@ -118,6 +120,19 @@ def test_frames_are_subsampled_and_limited():
     assert episode.frame_steps == 5
     assert len(episode.frames) == 6
     assert len(play_episode(constant(), "acrobot", max_frames=3, **options).frames) == 3
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others need no name of a display")
+@pytest.mark.parametrize(("display", "driver"), [(None, "dummy"), (":0", None)])
+def test_pictures_need_no_display(monkeypatch, display, driver):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "")  # so that it is as it was afterwards
+    monkeypatch.delenv("SDL_VIDEODRIVER")
+    if display is not None:
+        monkeypatch.setenv("DISPLAY", display)
+    _prepare_pygame(SimulatedWorld(get_task("pendulum")))
+    assert os.environ.get("SDL_VIDEODRIVER") == driver
 
 
 def test_pictures_without_pygame(monkeypatch):
