@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,13 +16,8 @@ from brief import STEPS, shorten
 import phihp_torchrl
 import phihp_torchrl.tdmpc  # its phase and agent stay registered
 from phihp_torchrl.commands import learn
-from phihp_torchrl.config import METHODS, override_lines
+from phihp_torchrl.config import Registry, override_lines
 from phihp_torchrl.config.choices import _OFFERED
-from phihp_torchrl.deployment import AGENT_KINDS
-from phihp_torchrl.planners import PLANNERS
-from phihp_torchrl.tasks.registry import _TASKS
-from phihp_torchrl.trainers import PHASES
-from phihp_torchrl.worlds import WORLDS
 from phihp_torchrl.worlds.simulated.plant import _PLANTS
 from tests.docs.blocks import ROOT, write_titled
 
@@ -65,8 +61,8 @@ TINY = {
 @contextmanager
 def as_before(place: Path) -> Iterator[None]:
     """Afterwards nothing is registered or imported from ``place``, as after a process."""
-    tables = [_OFFERED, _PLANTS]
-    tables += [r._entries for r in (METHODS, AGENT_KINDS, PLANNERS, _TASKS, PHASES, WORLDS)]
+    registries = [each for each in gc.get_objects() if isinstance(each, Registry)]  # none forgotten
+    tables = [_OFFERED, _PLANTS, *(each._entries for each in registries)]
     before = [dict(table) for table in tables]
     try:
         yield
