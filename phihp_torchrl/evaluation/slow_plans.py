@@ -5,12 +5,9 @@ from __future__ import annotations
 import logging
 
 from phihp_torchrl.deployment import Agent
-from phihp_torchrl.planners import CEMConfig
+from phihp_torchrl.planners import FAST_LIMITS, CEMConfig
 
 _log = logging.getLogger(__name__)
-
-# The plan of budget=fast: actions, and candidates of all its iterations.
-_FAST_HORIZON, _FAST_CANDIDATES = 3, 64
 
 
 def warn_of_slow_plans(agent: Agent, milliseconds: float) -> None:
@@ -40,8 +37,9 @@ def _smaller(agent: Agent) -> list[str]:
     config = agent.planner_config
     if type(agent) is not Agent or not isinstance(config, CEMConfig):  # it changes no others
         return []
-    candidates = config.num_candidates * config.optim_steps
-    larger = config.planning_horizon > _FAST_HORIZON or candidates > _FAST_CANDIDATES
+    longer = config.planning_horizon > FAST_LIMITS["planning_horizon"]
+    most = FAST_LIMITS["num_candidates"] * FAST_LIMITS["optim_steps"]
+    larger = longer or config.num_candidates * config.optim_steps > most
     return ["a smaller plan (phihp train ... budget=fast)"] if larger else []
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from phihp_torchrl.planners.candidates import Plan
-from phihp_torchrl.planners.cem import RESTS, CEMConfig, cem_plan
+from phihp_torchrl.planners.cem import FAST_LIMITS, RESTS, CEMConfig, cem_plan
 from phihp_torchrl.planners.cem_planner import CEMPlanner
 from phihp_torchrl.planners.colored_noise import colored
 from phihp_torchrl.planners.mppi import MPPIConfig, MPPINoise, MPPIPlan, mppi_plan

@@ -33,6 +33,15 @@ from phihp_torchrl.tasks import ActionBounds
 RESTS = 0.02
 """Mean change of the action from step to step, in half-ranges, up to which one rests."""
 
+FAST_LIMITS = {
+    "planning_horizon": 3,
+    "optim_steps": 2,
+    "num_candidates": 32,
+    "top_k": 6,
+    "num_policy_candidates": 8,
+}
+"""What a plan has at most on the fast budget (``config/settings/budget/fast.yaml``)."""
+
 
 @dataclass(frozen=True)
 class CEMConfig(SearchConfig):

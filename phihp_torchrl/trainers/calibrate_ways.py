@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
-from phihp_torchrl.planners import SearchConfig
+from phihp_torchrl.planners import FAST_LIMITS, SearchConfig
 
 LEAVING = ("leaving", "priced")
 """The ways that leave an actor alone where it rests."""
@@ -17,14 +17,6 @@ _NOTHING = 1e-3
 _ABOVE = 5.0
 # A search that goes on from the previous plan, and keeps it unless another is better.
 _STANDING = {"noise_beta": 2.0, "warm_start": True, "keep_incumbent": True}
-# What a plan has at most on the fast budget (config/settings/budget/fast.yaml).
-_FAST_LIMITS = {
-    "planning_horizon": 3,
-    "optim_steps": 2,
-    "num_candidates": 32,
-    "top_k": 6,
-    "num_policy_candidates": 8,
-}
 # Std of the search near the previous plan, in units of the half-range.
 _NEAR, _NEARER, _NEAREST = 0.3, 0.1, 0.03
 # Steps of the calmest plan, at most.
@@ -116,7 +108,7 @@ def faster(config: SearchConfig, changes: Mapping[str, Any]) -> dict[str, Any]:
         {}
     """
     known = {field.name for field in fields(config)}
-    less = {name: most for name, most in _FAST_LIMITS.items() if name in known}
+    less = {name: most for name, most in FAST_LIMITS.items() if name in known}
     less = {name: most for name, most in less.items() if getattr(config, name) > most}
     cheap = _fitting(config, {**changes, **less})
     return cheap if less else {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from phihp_torchrl import load_config
-from phihp_torchrl.planners import CEMConfig, MPPIConfig
+from phihp_torchrl.planners import FAST_LIMITS, CEMConfig, MPPIConfig
 from phihp_torchrl.trainers import (
     read_run_config,
 )
@@ -54,3 +54,8 @@ def test_the_fast_budget_is_that_of_the_settings():
     changes = faster(CEMConfig(50, optim_steps=9, num_candidates=900, top_k=90), {})
     assert changes == {name: getattr(fast, name) for name in changes}
     assert len(changes) == 5
+
+
+def test_the_limits_are_those_of_the_fast_budget() -> None:
+    planner = load_config("pendulum", overrides=["budget=fast"])["planner"]
+    assert {name: planner[name] for name in FAST_LIMITS} == FAST_LIMITS
