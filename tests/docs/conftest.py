@@ -61,7 +61,8 @@ TINY = {
 @contextmanager
 def as_before(place: Path) -> Iterator[None]:
     """Afterwards nothing is registered or imported from ``place``, as after a process."""
-    registries = [each for each in gc.get_objects() if isinstance(each, Registry)]  # none forgotten
+    # Every registry, so that none is forgotten. `isinstance` would ask dead weak references.
+    registries = [each for each in gc.get_objects() if issubclass(type(each), Registry)]
     tables = [_OFFERED, _PLANTS, *(each._entries for each in registries)]
     before = [dict(table) for table in tables]
     try:
