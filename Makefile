@@ -9,11 +9,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt
 STAMP := $(VENV)/.installed
+TEST_STAMP := $(VENV)/.installed-test
 DOCS_STAMP := $(VENV)/.installed-docs
 
 # One intra-op thread: two threads on two busy cores are many times slower, not faster.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
-HEADLESS := SDL_VIDEODRIVER=dummy MPLBACKEND=Agg WANDB_MODE=disabled
+HEADLESS := SDL_VIDEODRIVER=dummy MPLBACKEND=Agg MUJOCO_GL=disabled WANDB_MODE=disabled
 # Whatever the shell says: each of the processes of the tests would compile all modules anew.
 KEEP_BYTECODE := PYTHONDONTWRITEBYTECODE=
 
@@ -29,7 +30,7 @@ help: ## print these targets
 demo: $(STAMP) ## learn PendulumSwingup and watch it swing up
 	$(ONE_THREAD) $(BIN)/python recipes/demo.py $(ARGS)
 
-test: $(STAMP) ## run the tests (ARGS="-m 'not slow'" for the quick ones)
+test: $(TEST_STAMP) ## run the tests (ARGS="-m 'not slow'" for the quick ones)
 	$(ONE_THREAD) $(HEADLESS) $(KEEP_BYTECODE) $(BIN)/python -m pytest -n 2 --dist worksteal $(ARGS)
 
 lint: $(STAMP) ## ruff (lint and format) and mypy, changing nothing
@@ -92,6 +93,13 @@ else
 	@$(BIN)/python .ci/lock.py --fits
 	@$(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r requirements.lock
 	@$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .
+endif
+	@touch $@
+
+# The worlds and launchers that tests alone need; without them those tests are skipped.
+$(TEST_STAMP): $(STAMP)
+ifeq ($(LOCKED),)
+	@$(PIP) -e ".[dev,cluster,dmcontrol]"
 endif
 	@touch $@
 

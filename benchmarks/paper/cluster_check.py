@@ -2,10 +2,10 @@
 
     python benchmarks/paper/cluster_check.py
 
-Starts Ray's own test cluster, two nodes on this machine, and twelve small cells on it; kills one
-node while a cell of its is under way; then runs the same cells once more without Ray, and compares
-the two reports, times apart, byte by byte. Needs the extra `cluster`; everything goes into
-outputs/cluster_check/. Exit code 1 if anything differs.
+Starts Ray's own test cluster, two nodes on this machine, and twelve small cells on it, of two tasks
+and six seeds (``--seeds``); kills one node while a cell of its is under way; then runs the same
+cells once more without Ray, and compares the two reports, times apart, byte by byte. Needs the
+extra `cluster`; everything goes into outputs/cluster_check/. Exit code 1 if anything differs.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from pathlib import Path
 from measures import read_curve, write_curve
 from report import ReportConfig, make_report
 
-TASKS, SEEDS, SHARE = ("pendulum", "cartpole"), range(6), 0.05
-CELLS = len(TASKS) * len(SEEDS)
+TASKS, SEEDS, SHARE = ("pendulum", "cartpole"), 6, 0.05
 
 # The least that the phases can do; the tests of the commands take it too.
 TINY = (
@@ -72,15 +71,15 @@ SMALL = (
 )
 
 
-def grid_command(place: Path, launcher: str) -> list[str]:
-    """The twelve cells, with all they leave in ``place``."""
+def grid_command(place: Path, launcher: str, seeds: int) -> list[str]:
+    """The cells, with all they leave in ``place``."""
     overrides = ",".join(f'"{override}"' for override in SMALL)
     return [
         sys.executable,
         str(Path(__file__).with_name("run_grid.py")),
         f"launcher={launcher}",
         f"task={','.join(TASKS)}",
-        f"seed=range({len(SEEDS)})",
+        f"seed=range({seeds})",
         f"share={SHARE}",
         f"runs={place / 'runs'}",
         f"results={place / 'results'}",
@@ -91,7 +90,7 @@ def grid_command(place: Path, launcher: str) -> list[str]:
     ]
 
 
-def run_with_a_kill(place: Path, timeout: float) -> str:
+def run_with_a_kill(place: Path, timeout: float, seeds: int) -> str:
     """Run the cells on two nodes and kill one; returns the cells it was at."""
     from ray.cluster_utils import Cluster
 
@@ -99,8 +98,8 @@ def run_with_a_kill(place: Path, timeout: float) -> str:
     second = cluster.add_node(num_cpus=1)
     environment = {**os.environ, "RAY_ADDRESS": cluster.address}
     try:
-        with subprocess.Popen(grid_command(place, "ray"), env=environment) as process:
-            under_way = wait(lambda: middle(place), process, timeout)
+        with subprocess.Popen(grid_command(place, "ray", seeds), env=environment) as process:
+            under_way = wait(lambda: middle(place, seeds), process, timeout)
             cluster.remove_node(second, allow_graceful=False)
             print(f"killed a node; done {len(done(place))}, under way {under_way}", flush=True)
             process.wait(timeout)
@@ -125,10 +124,10 @@ def done(place: Path) -> list[str]:
     return sorted(path.parent.name for path in (place / "results").glob("*/evaluation.json"))
 
 
-def middle(place: Path) -> str:
+def middle(place: Path, seeds: int) -> str:
     """The two cells under way, once a third of all are done; else an empty text."""
     finished = done(place)
-    if len(finished) < CELLS // 3:
+    if len(finished) < len(TASKS) * seeds // 3:
         return ""
     halves = [
         path.parent.name
@@ -163,8 +162,8 @@ def report_files(place: Path, compared: Path) -> dict[str, bytes]:
     """The report on a place's runs, with all times set to zero, by file."""
     shutil.rmtree(compared, ignore_errors=True)
     shutil.copytree(place / "results", compared / "results")
-    for folder in (compared / "results").iterdir():
-        forget_times(folder)
+    for evaluation in (compared / "results").glob("*/evaluation.json"):
+        forget_times(evaluation.parent)
     make_report(
         ReportConfig(
             runs=str(compared / "results"),
@@ -193,16 +192,17 @@ def forget_times(folder: Path) -> None:
     write_curve(folder / "curve.csv", curve)
 
 
-def check(place: Path, timeout: float = 900.0) -> list[str]:
+def check(place: Path, timeout: float = 900.0, seeds: int = SEEDS) -> list[str]:
     """Everything that went wrong, a sentence each."""
     shutil.rmtree(place, ignore_errors=True)
     with_kill, without = place / "with_kill", place / "without"
-    run_with_a_kill(with_kill, timeout)
-    subprocess.run(grid_command(without, "basic"), check=False, timeout=timeout)
+    run_with_a_kill(with_kill, timeout, seeds)
+    subprocess.run(grid_command(without, "basic", seeds), check=False, timeout=timeout)
+    cells = len(TASKS) * seeds
     wrong = [
-        f"{where.name}: {len(done(where))} of {CELLS} cells are done"
+        f"{where.name}: {len(done(where))} of {cells} cells are done"
         for where in (with_kill, without)
-        if len(done(where)) != CELLS
+        if len(done(where)) != cells
     ]
     wrong += twice_done(with_kill)
     again = interrupted(with_kill)
@@ -220,12 +220,14 @@ def main() -> None:
     """Check and say how it went."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", default="outputs/cluster_check", help="directory for all of it")
-    wrong = check(Path(parser.parse_args().out).absolute())
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="cells of each task")
+    given = parser.parse_args()
+    wrong = check(Path(given.out).absolute(), seeds=given.seeds)
     for sentence in wrong:
         print(f"wrong: {sentence}")
     if wrong:
         sys.exit(1)
-    print(f"all {CELLS} cells done, none twice, and the report is that of a run without the kill")
+    print(f"all {len(TASKS) * given.seeds} cells done, none twice; the report is as without the kill")
 
 
 if __name__ == "__main__":
