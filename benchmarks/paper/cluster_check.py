@@ -227,7 +227,9 @@ def main() -> None:
         print(f"wrong: {sentence}")
     if wrong:
         sys.exit(1)
-    print(f"all {len(TASKS) * given.seeds} cells done, none twice; the report is as without the kill")
+    print(
+        f"all {len(TASKS) * given.seeds} cells done, none twice; the report is as without the kill"
+    )
 
 
 if __name__ == "__main__":

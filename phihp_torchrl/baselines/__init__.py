@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from phihp_torchrl.baselines.catch import Catch
 from phihp_torchrl.baselines.controller import Controller
 from phihp_torchrl.baselines.energy_shaping import EnergyShaping, PumpConfig
 from phihp_torchrl.baselines.ilqr import ILQR, ILQRConfig

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from phihp_torchrl.baselines.energy import find_energy
 from phihp_torchrl.baselines.lqr import LQR
-from phihp_torchrl.baselines.point import half_ranges, physical_step
+from phihp_torchrl.baselines.point import LinearModel, half_ranges, physical_step
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.tasks import Task
 
 _SAMPLES = 512
@@ -23,6 +26,122 @@ _EFFORTS = (1.0, 10.0)
 """Weights of a full action that are tried: dear actions saturate later, cheap ones are faster."""
 _CART_EFFORTS = (10.0,)
 """Those for a cart: with cheap actions its regulator leans on learned friction."""
+
+
+class Catch(nn.Module):
+    r"""A regulator at the goal that takes over from another controller where it is near enough.
+
+    It acts where the cost-to-go :math:`z^\top P z` of the regulator is below a level, by
+    :math:`u = u_0 - K z`, and leaves all other states to whoever acted there. So plans have only to
+    come near the goal; there the regulator holds it, without the noise of a search and at a
+    thousandth of the cost (dual-mode control: Michalska and Mayne, 1993,
+    https://doi.org/10.1109/9.262032).
+
+    Goal, gain, cost and level are its buffers, so it is saved with an agent's weights.
+
+    Args:
+        task: the task.
+        moved: the registers of the task that belong to its state, by their places
+            (:class:`~phihp_torchrl.baselines.point.LinearModel`).
+
+    Examples:
+        >>> from phihp_torchrl import HybridDynamics, get_task
+        >>> task = get_task("pendulum-swingup")
+        >>> catch = Catch.from_model(task, HybridDynamics.pure_prior(task))
+        >>> states = torch.tensor([[0.01, 0.0], [torch.pi, 0.0]])
+        >>> catch.near(states)
+        tensor([ True, False])
+        >>> held = catch(states, torch.full((2, 1), 2.0))
+        >>> bool(held[0] < 0), held[1].item()
+        (True, 2.0)
+    """
+
+    at: Tensor
+    keeping: Tensor
+    gain: Tensor
+    cost: Tensor
+    level: Tensor
+
+    def __init__(self, task: Task, moved: tuple[int, ...] = ()) -> None:
+        super().__init__()
+        self.task, self.moved = task, tuple(moved)
+        size, actions = task.system.state_dim + len(self.moved), task.action_dim
+        shapes = {
+            "at": [size],
+            "keeping": [actions],
+            "gain": [actions, size],
+            "cost": [size, size],
+            "level": [],
+        }
+        for name, shape in shapes.items():
+            self.register_buffer(name, torch.zeros(shape))
+
+    @classmethod
+    def from_model(cls, task: Task, dynamics: nn.Module, share: float = 1.0) -> Catch:
+        """Build it in a model: the regulator that catches from furthest, and its level.
+
+        Args:
+            task: the task, with a goal in which the model rests.
+            dynamics: the model, ``(state, action) -> next state``.
+            share: share of the level from which the model shows that the regulator arrives.
+
+        Raises:
+            ConfigError: where there is no regulator, as :meth:`LQR.from_model`, and where it
+                arrives from nowhere.
+        """
+        lqr, level = find_catch(task, dynamics)
+        if level <= 0:
+            raise ConfigError("goal", "expected one at which a regulator arrives, got none.")
+        made = cls(task, lqr.point.moved)
+        made.at.copy_(lqr.point.state)
+        made.keeping.copy_(lqr.point.action)
+        made.gain.copy_(lqr.gain)
+        made.cost.copy_(lqr.cost)
+        made.level.fill_(share * level)
+        return made
+
+    def near(self, state: Tensor) -> Tensor:
+        """Whether it acts in a state of the task ``[*batch, n]``, bool ``[*batch]``."""
+        error = self._error(state)
+        return ((error @ self.cost.to(state)) * error).sum(-1) < self.level.to(state)
+
+    def act(self, state: Tensor) -> Tensor:
+        """Its action in a state ``[*batch, n]``, within its bounds, ``[*batch, m]``."""
+        action = self.keeping.to(state) - self._error(state) @ self.gain.to(state).mT
+        return self.task.clip_action(action)
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """Its action ``[*batch, m]`` in states that are near, and ``action`` in all others."""
+        return torch.where(self.near(state).unsqueeze(-1), self.act(state), action)
+
+    def closer(self, share: float) -> Catch:
+        """The same regulator, which takes over at a share of the level."""
+        made = Catch(self.task, self.moved)
+        made.load_state_dict(self.state_dict() | {"level": share * self.level})
+        return made.to(self.level.device)
+
+    def _error(self, state: Tensor) -> Tensor:
+        none = np.zeros((len(self.at), len(self.at)))
+        point = LinearModel(self.task, self.at, self.keeping, none, none, self.moved)
+        return point.difference(state)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Plain values from which it can be built again, without the buffers."""
+        return {"moved": list(self.moved)}
+
+    @classmethod
+    def from_config(cls, task: Task, config: Mapping[str, Any]) -> Catch:
+        """Build what :attr:`config` describes, with buffers of zeros.
+
+        Raises:
+            ConfigError: for registers that the task does not have; the message names the key.
+        """
+        moved = config["moved"]
+        places = range(task.register_count)
+        if not isinstance(moved, (list, tuple)) or not set(moved) <= set(places):
+            raise ConfigError("moved", f"expected places below {len(places)}, got {moved!r}.")
+        return cls(task, tuple(moved))
 
 
 def find_catch(task: Task, dynamics: nn.Module) -> tuple[LQR, float]:

@@ -25,6 +25,8 @@ _STILL = 1e-12
 """The motion below which a rest is not sought any better."""
 _SAMPLES = 512
 """States of the wide box whose rewards are compared with that of a goal."""
+_TRIED = 8
+"""Of these, the states near which a rest is sought where the middle of the box is none."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,8 @@ def linearise(
         task: the task.
         dynamics: the model, ``(state, action) -> next state``.
         goal: the physical state at which to linearise. Defaults to the task's goal: the centre of
-            its box ``goal``, or else a state at rest whose reward no state of the wide box exceeds.
+            its box ``goal``, or else a state at rest whose reward no state of the wide box exceeds:
+            the centre of that box or of the reset box, or a rest near states that earn most.
         registers: whether the registers that an action moves, such as commands under way and the
             last action, belong to the state. Those of a reference and of an estimated disturbance
             never do.
@@ -212,7 +215,11 @@ def _rest(
             if box is not None
         ]
     reasons = []
-    for state in places:
+    sought = [(state, free) for state in places]
+    if goal is None and task.goal is None and not follows:
+        everywhere = list(range(task.system.state_dim))
+        sought += [(state, everywhere) for state in _most_rewarded(task)]
+    for state, free in sought:
         state, action, drift = trim(task, step, state, free)
         if drift > DRIFT:
             reasons.append(f"the model drifts from {_text(state)} by {drift:.2g} half-ranges")
@@ -221,6 +228,25 @@ def _rest(
         else:
             return state, action
     raise ConfigError("goal", f"expected a state to stay in: {'; '.join(reasons)}.")
+
+
+def _most_rewarded(task: Task) -> list[Tensor]:
+    """The states without velocity of the wide box that earn most, without ending the episode.
+
+    There are none where most states earn as much.
+    """
+    box = task.coverage or task.reset
+    states = box.sample([_SAMPLES], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    names = task.system.state_names
+    states[:, [names.index(name) for name in task.system.velocity_of.values()]] = 0.0
+    actions = task.bounds.center.double().expand(_SAMPLES, -1)
+    with torch.no_grad():
+        earned = task.reward(states, actions, states)
+        over = task.is_terminated(task.at_rest(states))
+    states, earned = states[~over], earned[~over]
+    if not (len(earned) and earned.max() > earned.median()):
+        return []
+    return list(states[earned.argsort(descending=True)[:_TRIED]])
 
 
 def trim(

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 
 from phihp_torchrl.agents import Actor, TwinQ
-from phihp_torchrl.baselines import Controller
+from phihp_torchrl.baselines import Catch, Controller
 from phihp_torchrl.config import ConfigError, kind_mapping, read_kind, resolve_seconds
 from phihp_torchrl.deployment.under_way import UnderWay
 from phihp_torchrl.deployment.warm_up import WarmUp
@@ -47,6 +47,8 @@ class Agent(TensorDictModuleBase):
             a method ``reset()`` that has ``"is_init"`` among its ``in_keys``. The ``reset`` of
             another, and of a network in a ``TensorDictModule``, is not called.
         qvalue: the critics, for the value beyond the planner's horizon.
+        catch: a regulator that acts near the task's goal in the place of a plan, which is then not
+            sought (:class:`~phihp_torchrl.baselines.Catch`), or ``None``.
         planner_config: settings of the planner; ``None`` for an agent without a planner.
         use_planner: whether to plan; ``False`` is the actor alone. See also :meth:`actor_alone`.
         compile: whether to compile the plan (10 to 40 s the first time, from the cache afterwards).
@@ -86,6 +88,7 @@ class Agent(TensorDictModuleBase):
         dynamics: HybridDynamics | None = None,
         actor: Actor | TensorDictModuleBase | None = None,
         qvalue: TwinQ | TensorDictModuleBase | None = None,
+        catch: Catch | None = None,
         planner_config: SearchConfig | None = None,
         use_planner: bool = True,
         compile: bool | dict[str, Any] = False,
@@ -102,6 +105,7 @@ class Agent(TensorDictModuleBase):
         self.dynamics = dynamics
         self.actor = actor
         self.qvalue = qvalue
+        self.catch = catch
         if planner_config is not None:
             planner_config = resolve_seconds(planner_config, task.time_step)
         self.planner_config = planner_config
@@ -180,7 +184,7 @@ class Agent(TensorDictModuleBase):
 
     def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.planner is not None:
-            return self._plan(tensordict)
+            return self._plan(tensordict) if self.catch is None else self._hold(tensordict)
         observation = self._check(tensordict.get("observation", None), tensordict.batch_size)
         network, action = getattr(self.actor, "module", None), None
         if isinstance(network, Actor) and not _is_followed(self.actor):
@@ -192,6 +196,24 @@ class Agent(TensorDictModuleBase):
     def _plan(self, tensordict: TensorDictBase) -> TensorDictBase:
         assert self.planner is not None
         return self.planner(tensordict)
+
+    def _hold(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Plan, but where the regulator acts; where it does in all rows, no plan is sought."""
+        assert self.catch is not None
+        observation = tensordict.get("observation", None)
+        if observation is None or observation.shape[-1:] != (self.task.observation_dim,):
+            return self._plan(tensordict)  # which says what is wrong
+        state = self.task.locate(observation)
+        near = self.catch.near(state)
+        starts = tensordict.get("is_init", None)
+        if near.all() and (starts is None or not starts.any()):
+            held, missed = self.catch.act(state), 1
+        else:
+            planned = self._plan(tensordict)["action"]
+            held = torch.where(near.unsqueeze(-1), self.catch.act(state), planned)
+            missed = 0
+        self.follow(held, missed)
+        return tensordict.set("action", held)
 
     def _planner_input(self, tensordict: TensorDictBase) -> TensorDictBase:
         """What the planner is given for an observation."""
@@ -258,7 +280,7 @@ class Agent(TensorDictModuleBase):
             config: settings of the planner; ``None`` for the actor alone.
             options: ``compile``.
         """
-        parts = {name: getattr(self, name) for name in ("dynamics", "actor", "qvalue")}
+        parts = {name: getattr(self, name) for name in ("dynamics", "actor", "qvalue", "catch")}
         return Agent(
             self.task,
             **parts,
@@ -276,6 +298,7 @@ class Agent(TensorDictModuleBase):
             "dynamics": self.dynamics,
             "actor": getattr(self.actor, "module", self.actor),
             "qvalue": getattr(self.qvalue, "module", self.qvalue),
+            "catch": self.catch,
         }
         return {name: part for name, part in parts.items() if part is not None}
 
@@ -303,7 +326,7 @@ class Agent(TensorDictModuleBase):
     @classmethod
     def build_modules(cls, task: Task, config: Mapping[str, Any]) -> dict[str, Any]:
         """Build the modules that :attr:`config` describes, untrained."""
-        classes = {"dynamics": HybridDynamics, "actor": Actor, "qvalue": TwinQ}
+        classes = {"dynamics": HybridDynamics, "actor": Actor, "qvalue": TwinQ, "catch": Catch}
         return {
             name: classes[name].from_config(task, config[name])  # type: ignore[attr-defined]
             for name in classes

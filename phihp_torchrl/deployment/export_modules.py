@@ -80,7 +80,7 @@ class PlanModule(ExportModule):
     ``warm_start`` that is ``plan`` ``[H, m]``, for which the module returns the next one beside the
     action; with ``change_cost`` or ``keep_incumbent`` it is ``last`` ``[m]``, the action that was
     sent last, NaN where there is none. It plans at every step, and a warning says so where
-    ``replan_every`` is another.
+    ``replan_every`` is another. Near the goal the action is the regulator's, if the agent has one.
 
     Args:
         agent: an agent that plans by a :class:`~phihp_torchrl.CEMPlanner`.
@@ -128,6 +128,7 @@ class PlanModule(ExportModule):
             memory[LAST] = torch.full_like(center, torch.nan)
         super().__init__(agent.task, shape, memory)
         self.planner = planner  # whose parameters are then this module's
+        self.catch = agent.catch
         # The first call keeps the filter of this shape, which an export then takes as a constant.
         colored(torch.zeros(shape), planner.settings.noise_beta, dim=1)
 
@@ -144,9 +145,12 @@ class PlanModule(ExportModule):
             problem=planner.problem(compiled=self.in_loop),
             settings=planner.settings,
         )
+        action = found.actions[0]
+        if self.catch is not None:
+            action = self.catch(self.task.locate(observation), action)
         if PLAN not in kept:
-            return found.actions[0]
-        return found.actions[0], torch.cat([found.actions[1:], self.memory[PLAN][-1:]])
+            return action
+        return action, torch.cat([found.actions[1:], self.memory[PLAN][-1:]])
 
 
 class ActorModule(ExportModule):

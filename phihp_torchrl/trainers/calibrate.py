@@ -13,9 +13,15 @@ from torch import Tensor, nn
 
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.planners import RESTS, SearchConfig, score_sequences
+from phihp_torchrl.trainers.calibrate_catch import CatchTrial
 from phihp_torchrl.trainers.calibrate_config import CalibrateConfig
 from phihp_torchrl.trainers.calibrate_contest import KNOWN, Contest
-from phihp_torchrl.trainers.calibrate_report import report, summary, warn_of_doubt, write_table
+from phihp_torchrl.trainers.calibrate_report import (
+    report,
+    summary,
+    warn_of_doubt,
+    write_table,
+)
 from phihp_torchrl.trainers.calibrate_rule import Choice, choose, in_doubt, loses_nothing
 from phihp_torchrl.trainers.calibrate_ways import LEAVING, calmer, faster, leaving
 from phihp_torchrl.trainers.context import Context
@@ -41,6 +47,10 @@ class CalibratePhase:
     too if it rests. The way that is chosen plays the same episodes on the fast budget, and keeps
     that if it loses nothing. It then plays more episodes, until it is certain whether it earns more
     than the actor. No real step is taken.
+
+    Where the agent does not come to rest, but the task has a goal in which the model would, a
+    regulator acts near it in the place of plans if the agent loses nothing by it
+    (:class:`~phihp_torchrl.trainers.calibrate_catch.CatchTrial`).
 
     Where other models that fit the data about as well say that the actor earns something else, the
     settings stay as given and the plan acts unless it is certain to earn less, and a warning says
@@ -93,6 +103,7 @@ class CalibratePhase:
         starts = agent.task.sample_start([config.max_episodes], generator)
         starts = starts.to(next(agent.parameters()).device)
         self.contest = Contest(agent, config, starts, seed)
+        self.trial = CatchTrial(self.contest)
 
     @property
     def done(self) -> bool:
@@ -133,13 +144,14 @@ class CalibratePhase:
             "chatter": way.mean_chatter,
         }
         if contest.equal:
-            choice = self._choose() if self.chosen is None else self._judge()
+            choice = self._decide()
             metrics["acting_planner"] = float(choice.acting == "planner")
         return {f"calibrate/{key}": value for key, value in metrics.items()}
 
     def parts(self) -> dict[str, Any]:
         """The planner's settings and how to act, as arguments of :class:`~phihp_torchrl.Agent`."""
         return {
+            "catch": self.trial.made(self.final.get("catch")),
             "planner_config": self.planner_config,
             "use_planner": self.acting == "planner",
             "metadata": {"acting": self.acting, "calibration": self.final},
@@ -152,6 +164,7 @@ class CalibratePhase:
             "elsewhere": list(self.elsewhere),
             "doubted": self.doubted,
             "chosen": None if self.chosen is None else tuple(self.chosen),
+            "trial": self.trial.state_dict(),
             "final": dict(self.final),
         }
 
@@ -162,6 +175,8 @@ class CalibratePhase:
         self.doubted = bool(state.get("doubted", False))
         chosen = state.get("chosen")
         self.chosen = None if chosen is None else Choice(*chosen)
+        if "trial" in state:  # older checkpoints know of no regulator
+            self.trial.load_state_dict(state["trial"])
         self.final = dict(state["final"])
 
     def _ways(self) -> dict[str, dict[str, Any]]:
@@ -203,6 +218,14 @@ class CalibratePhase:
         gain = (planner.plan(seen).score - own).clamp_min(0)
         gain = gain[gain.isfinite()]
         return gain.quantile(_PROMISE_SHARE).item() if len(gain) else 0.0
+
+    def _decide(self) -> Choice:
+        """Decide by what has been played; the choice so far."""
+        if self.trial.settled is not None:
+            if not self.trial.judge():
+                self._record()
+            return self.trial.choice
+        return self._choose() if self.chosen is None else self._judge()
 
     def _choose(self) -> Choice:
         """Choose a way to plan; once all have played, let it alone play on, until it is known."""
@@ -246,11 +269,20 @@ class CalibratePhase:
         return choice
 
     def _finish(self, choice: Choice) -> None:
-        """Record the choice."""
-        ways, actor = self.contest.all_ways(), self.contest.actor(self.contest.episodes)
-        models = {"models_disagree": self.doubted, "actor_elsewhere": self.elsewhere}
-        budget = {"budget": _FAST if choice.name == _FAST else "given"}
-        self.final = summary(choice, ways, actor) | budget | models
+        """Settle the choice, and let a regulator near the goal play beside it if there is one."""
+        if not self.trial.begin(choice, doubted=self.doubted):
+            self._record()
+
+    def _record(self) -> None:
+        """Record the choice, and the regulator near the goal if one is kept."""
+        choice, actor = self.trial.choice, self.contest.actor(self.trial.episodes)
+        self.final = {
+            **summary(choice, self.contest.all_ways(), actor),
+            "budget": _FAST if choice.name == _FAST else "given",
+            "models_disagree": self.doubted,
+            "actor_elsewhere": self.elsewhere,
+            "catch": self.trial.record(),
+        }
         report(self.final)
         if self.path is not None:
             write_table(self.path, self.final, self.planner_config)

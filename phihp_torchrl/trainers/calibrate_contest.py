@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from phihp_torchrl.baselines import Catch
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.trainers.calibrate_budget import Price, first_episodes, of_ways
@@ -53,6 +54,8 @@ class Contest:
         self.world_model = TaskWorldModel(agent.task, agent.dynamics)
         self.starts, self.seed, self.price = starts, seed, Price.of(agent)
         self.ways: dict[str, dict[str, Any]] = {}
+        self.catches: dict[str, Catch] = {}
+        """The regulators that act near the goal, of the ways that have one."""
         self.playing: list[str] = []
         self.episodes, self.spent = 0, 0.0
         self._played: dict[str, list[list[float]]] = {}
@@ -90,6 +93,7 @@ class Contest:
         lot = slice(self.episodes - count, self.episodes)
         assert self.agent.planner_config is not None
         agent = self.agent.with_planner(replace(self.agent.planner_config, **self.ways[name]))
+        agent.catch = self.catches.get(name)
         seed = self.seed + lot.start
         found = play(agent, self.world_model, self.starts[lot], seed=seed)
         self.spent += self._cost(name, count, len(found.changes))
@@ -111,9 +115,17 @@ class Contest:
         self.episodes += max(more, 0)
         return more > 0
 
-    def add(self, name: str, changes: Mapping[str, Any]) -> None:
-        """Let one more way to plan play as many episodes as the last ones have."""
+    def add(self, name: str, changes: Mapping[str, Any], catch: Catch | None = None) -> None:
+        """Let one more way to plan play as many episodes as the last ones have.
+
+        Args:
+            name: its name.
+            changes: what it changes in the settings of the planner.
+            catch: what acts near the goal in the place of its plans.
+        """
         self.ways[name] = dict(changes)
+        if catch is not None:
+            self.catches[name] = catch
         self.playing, self._played[name] = [name], [[], []]
 
     def close(self) -> None:

@@ -62,6 +62,15 @@ def report(final: Mapping[str, Any]) -> None:
         final["actor_chatter"],
         final["acting"],
     )
+    if (catch := final.get("catch")) is not None:
+        _log.info(
+            "Near the goal a regulator acts in the place of plans: %+.4g ± %.2g in imagination "
+            "(chatter %.3f, and %.3f without it).",
+            catch["gain"],
+            catch["gain_error"],
+            catch["chatter"],
+            catch["chatter_before"],
+        )
     if final["certain"]:
         return
     if abs(final["gain"]) > _CLEAR * final["gain_error"]:

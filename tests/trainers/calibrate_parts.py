@@ -16,7 +16,7 @@ from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase
 SMALL = CEMConfig(
     planning_horizon=3, optim_steps=1, num_candidates=32, top_k=4, num_policy_candidates=2
 )
-TINY = CalibrateConfig(enabled=True, episodes=3, max_episodes=6)
+TINY = CalibrateConfig(enabled=True, episodes=3, max_episodes=6, catch=False)
 
 
 def make_agent(name: str = "brief-pendulum", planner: SearchConfig = SMALL) -> Agent:
