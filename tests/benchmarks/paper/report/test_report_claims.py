@@ -132,7 +132,7 @@ def test_a_cell_of_several_configurations_gets_no_verdict(tmp_path: Path) -> Non
         planned = {"planner": [9.0 + seed]}
         make_run(tmp_path / "runs", "td-mpc", seed=seed, samples=9000, acting=planned, ms=90.0)
     config = folder / "config.yaml"
-    config.write_text(config.read_text() + "evaluate: {first_seed: 2000000}\n")
+    config.write_text(config.read_text() + "evaluate: {first_seed: 2000100}\n")
     section = claims_section(results(tmp_path / "runs"))
     rows = {str(row[0]): [str(cell) for cell in row] for row in section.tables["Comparisons"].rows}
     assert {name: row[1] for name, row in rows.items()} == {
@@ -177,7 +177,7 @@ def test_cells_of_other_episodes_are_not_compared(tmp_path: Path) -> None:
         more = 0.1 * (seed - 100)
         acting = {"planner": [9.0 + more], "actor": [1.0 - more**2]}
         config = make_run(runs, seed=seed, acting=acting) / "config.yaml"
-        config.write_text(config.read_text() + "evaluate: {first_seed: 2000000}\n")
+        config.write_text(config.read_text() + "evaluate: {first_seed: 2000100}\n")
         make_run(runs, "td3", seed=seed, samples=300, acting={"actor": [5.0 + more]})
         acting = {"planner": [8.0 - more]}
         make_run(runs, "td-mpc", seed=seed, samples=9000, acting=acting, ms=90.0)
