@@ -16,5 +16,9 @@ from phihp_torchrl.baselines.registry import (
     make_baselines,
     register_baseline,
 )
+from phihp_torchrl.baselines.settle import Settle
+
+CATCHES = {sort.kind: sort for sort in (Catch, Settle)}
+"""The regulators that may take over from an agent's plans, by their kind in files."""
 
 __all__ = ["ILQR", "LQR", "PID", "EnergyShaping", "make_baselines", "register_baseline"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -56,6 +56,9 @@ class Catch(nn.Module):
         (True, 2.0)
     """
 
+    kind: ClassVar[str] = "goal"
+    """The name of this sort of regulator in files."""
+
     at: Tensor
     keeping: Tensor
     gain: Tensor
@@ -100,6 +103,16 @@ class Catch(nn.Module):
         made.level.fill_(share * level)
         return made
 
+    def take(self, state: Tensor, starts: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Where it acts, bool ``[*batch]``, and its action ``[*batch, m]``."""
+        return self.near(state), self.act(state)
+
+    def follow(self, sent: Tensor) -> None:
+        """Do nothing: it acts by the state alone."""
+
+    def reset(self) -> None:
+        """Do nothing, as :meth:`follow`."""
+
     def near(self, state: Tensor) -> Tensor:
         """Whether it acts in a state of the task ``[*batch, n]``, bool ``[*batch]``."""
         error = self._error(state)
@@ -128,7 +141,7 @@ class Catch(nn.Module):
     @property
     def config(self) -> dict[str, Any]:
         """Plain values from which it can be built again, without the buffers."""
-        return {"moved": list(self.moved)}
+        return {"kind": self.kind, "moved": list(self.moved)}
 
     @classmethod
     def from_config(cls, task: Task, config: Mapping[str, Any]) -> Catch:
@@ -137,11 +150,19 @@ class Catch(nn.Module):
         Raises:
             ConfigError: for registers that the task does not have; the message names the key.
         """
-        moved = config["moved"]
-        places = range(task.register_count)
-        if not isinstance(moved, (list, tuple)) or not set(moved) <= set(places):
-            raise ConfigError("moved", f"expected places below {len(places)}, got {moved!r}.")
-        return cls(task, tuple(moved))
+        return cls(task, check_moved(task, config["moved"]))
+
+
+def check_moved(task: Task, moved: Any) -> tuple[int, ...]:
+    """The places of registers that a file names.
+
+    Raises:
+        ConfigError: for others than the task has.
+    """
+    places = range(task.register_count)
+    if not isinstance(moved, (list, tuple)) or not set(moved) <= set(places):
+        raise ConfigError("moved", f"expected places below {len(places)}, got {moved!r}.")
+    return tuple(moved)
 
 
 def find_catch(task: Task, dynamics: nn.Module) -> tuple[LQR, float]:

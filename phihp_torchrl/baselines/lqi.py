@@ -81,6 +81,7 @@ class LQI(Controller):
     ) -> None:
         super().__init__(point.task)
         self.point, self.equilibria, self.times = point, equilibria, tuple(times)
+        self.regulator = regulator
         n = len(point.a)
         gain, cost = (torch.as_tensor(matrix) for matrix in regulator)
         self.register_buffer("gain", gain[:, :n])
@@ -157,6 +158,21 @@ class LQI(Controller):
         held = (over.unsqueeze(-1) * added > 0).any(-2)
         self._kept = torch.where(held, integral, integral + rates), at
         return action
+
+    def go_on_from(self, state: Tensor, action: Tensor, rows: Tensor) -> None:
+        """Set the integrals so that the action would be this one: it takes over without a jump.
+
+        Args:
+            state: states of the task, ``[*batch, n]``.
+            action: what was sent last, ``[*batch, m]``.
+            rows: where to do so, bool ``[*batch]``; elsewhere the integrals stay.
+        """
+        at, keeping = self.equilibria.at(present(self.task, self.task.split(state)[1]))
+        error = self.point.difference(state, at)
+        missing = keeping - error @ self.gain.to(state).mT - action
+        integral = missing @ torch.linalg.pinv(self.integral_gain.to(state)).mT
+        kept = self._recall(error, at, None)
+        self._kept = torch.where(rows.unsqueeze(-1), integral, kept), at
 
     def reset(self) -> None:
         """Start the integrals anew."""

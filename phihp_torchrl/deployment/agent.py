@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 
 from phihp_torchrl.agents import Actor, TwinQ
-from phihp_torchrl.baselines import Catch, Controller
+from phihp_torchrl.baselines import CATCHES, Catch, Controller, Settle
 from phihp_torchrl.config import ConfigError, kind_mapping, read_kind, resolve_seconds
 from phihp_torchrl.deployment.under_way import UnderWay
 from phihp_torchrl.deployment.warm_up import WarmUp
@@ -47,8 +47,9 @@ class Agent(TensorDictModuleBase):
             a method ``reset()`` that has ``"is_init"`` among its ``in_keys``. The ``reset`` of
             another, and of a network in a ``TensorDictModule``, is not called.
         qvalue: the critics, for the value beyond the planner's horizon.
-        catch: a regulator that acts near the task's goal in the place of a plan, which is then not
-            sought (:class:`~phihp_torchrl.baselines.Catch`), or ``None``.
+        catch: a regulator that acts near the task's goal, or on a reference that stands still, in
+            the place of a plan, which is then not sought (:class:`~phihp_torchrl.baselines.Catch`,
+            :class:`~phihp_torchrl.baselines.Settle`), or ``None``.
         planner_config: settings of the planner; ``None`` for an agent without a planner.
         use_planner: whether to plan; ``False`` is the actor alone. See also :meth:`actor_alone`.
         compile: whether to compile the plan (10 to 40 s the first time, from the cache afterwards).
@@ -88,7 +89,7 @@ class Agent(TensorDictModuleBase):
         dynamics: HybridDynamics | None = None,
         actor: Actor | TensorDictModuleBase | None = None,
         qvalue: TwinQ | TensorDictModuleBase | None = None,
-        catch: Catch | None = None,
+        catch: Catch | Settle | None = None,
         planner_config: SearchConfig | None = None,
         use_planner: bool = True,
         compile: bool | dict[str, Any] = False,
@@ -181,6 +182,8 @@ class Agent(TensorDictModuleBase):
         """
         if self.planner is not None and self.planner.receding is not None:
             self.planner.receding.follow(sent, missed)
+        if self.catch is not None:
+            self.catch.follow(sent)
 
     def _act(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.planner is not None:
@@ -203,15 +206,14 @@ class Agent(TensorDictModuleBase):
         observation = tensordict.get("observation", None)
         if observation is None or observation.shape[-1:] != (self.task.observation_dim,):
             return self._plan(tensordict)  # which says what is wrong
-        state = self.task.locate(observation)
-        near = self.catch.near(state)
         starts = tensordict.get("is_init", None)
-        if near.all() and (starts is None or not starts.any()):
-            held, missed = self.catch.act(state), 1
-        else:
-            planned = self._plan(tensordict)["action"]
-            held = torch.where(near.unsqueeze(-1), self.catch.act(state), planned)
-            missed = 0
+        if starts is not None:
+            starts = starts.reshape(tensordict.batch_size)
+        near, held = self.catch.take(self.task.locate(observation), starts)
+        missed = 1
+        if not near.all() or (starts is not None and starts.any()):
+            planned, missed = self._plan(tensordict)["action"], 0
+            held = torch.where(near.unsqueeze(-1), held, planned)
         self.follow(held, missed)
         return tensordict.set("action", held)
 
@@ -258,7 +260,7 @@ class Agent(TensorDictModuleBase):
         """
         if self._warm_up is not None and self._warm_up.take():
             self._warm_up = None
-        for part in (self.planner, self._memory):
+        for part in (self.planner, self._memory, self.catch):
             if part is not None:
                 part.reset()
         actor: Any = self.actor
@@ -326,9 +328,14 @@ class Agent(TensorDictModuleBase):
     @classmethod
     def build_modules(cls, task: Task, config: Mapping[str, Any]) -> dict[str, Any]:
         """Build the modules that :attr:`config` describes, untrained."""
-        classes = {"dynamics": HybridDynamics, "actor": Actor, "qvalue": TwinQ, "catch": Catch}
+        classes: dict[str, Any] = {"dynamics": HybridDynamics, "actor": Actor, "qvalue": TwinQ}
+        if config.get("catch") is not None:
+            kind = config["catch"]["kind"]
+            if kind not in CATCHES:
+                raise ConfigError("catch.kind", f"expected one of {list(CATCHES)}, got {kind!r}.")
+            classes["catch"] = CATCHES[kind]
         return {
-            name: classes[name].from_config(task, config[name])  # type: ignore[attr-defined]
+            name: classes[name].from_config(task, config[name])
             for name in classes
             if config.get(name) is not None
         }

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+from phihp_torchrl.baselines import Catch
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment.agent import Agent
 from phihp_torchrl.planners import CEMPlanner, cem_plan, colored
@@ -128,7 +129,12 @@ class PlanModule(ExportModule):
             memory[LAST] = torch.full_like(center, torch.nan)
         super().__init__(agent.task, shape, memory)
         self.planner = planner  # whose parameters are then this module's
-        self.catch = agent.catch
+        self.catch = agent.catch if isinstance(agent.catch, Catch) else None
+        if agent.catch is not self.catch:
+            _logger.warning(
+                "The regulator that acts where the reference stands still has a memory, and is "
+                "left out of a plan that is exported: it plans there too."
+            )
         # The first call keeps the filter of this shape, which an export then takes as a constant.
         colored(torch.zeros(shape), planner.settings.noise_beta, dim=1)
 

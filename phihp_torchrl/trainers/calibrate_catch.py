@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
-from phihp_torchrl.baselines import Catch
+from phihp_torchrl.baselines import Catch, Settle
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import RESTS
 from phihp_torchrl.trainers.calibrate_contest import Contest
-from phihp_torchrl.trainers.calibrate_rule import Choice, Way, loses_nothing
+from phihp_torchrl.trainers.calibrate_rule import Choice, Way, costs_little, loses_nothing
 
 # By name, shares of the level from which a regulator arrives; from far away it may take long.
 _SHARES = {"caught": 1.0, "caught close": 0.1}
@@ -19,10 +19,12 @@ _SHARES = {"caught": 1.0, "caught close": 0.1}
 class CatchTrial:
     """Lets the plan that was chosen play once more with a regulator near the goal.
 
-    It does so where the agent does not come to rest. The regulators are one, which takes over from
-    as far away as it arrives, or from a tenth of that cost-to-go
-    (:class:`~phihp_torchrl.baselines.Catch`). The first by which the agent loses nothing is kept;
-    where the actor is to act, it belongs to the plan, which has to be smoother than the actor.
+    It does so where the agent does not come to rest, or follows a reference. The regulators are
+    one, which takes over from as far away as it arrives, or from a tenth of that cost-to-go
+    (:class:`~phihp_torchrl.baselines.Catch`); on a reference, from near it where it stands still
+    (:class:`~phihp_torchrl.baselines.Settle`). The first by which the agent loses nothing is kept,
+    or no more than its smoothness may cost; where the actor is to act, it belongs to the plan,
+    which has to be smoother than the actor.
 
     Args:
         contest: the episodes, of which the ways to plan have played.
@@ -43,14 +45,18 @@ class CatchTrial:
             doubted: whether other models disagree, so that a regulator of this one is not tried.
         """
         self.settled = choice, self.contest.episodes
-        return not doubted and self.before.mean_chatter > RESTS and self._try_next()
+        follows = self.contest.agent.task.reference is not None
+        restless = follows or self.before.mean_chatter > RESTS
+        return not doubted and restless and self._try_next()
 
     def judge(self) -> bool:
         """Compare what has played with the agent without it; whether there is more to play."""
         contest, (name,) = self.contest, self.contest.playing
         way, before = contest.way(name), self.before
-        calmer = self.choice.acting == "planner" or way.smoother_than(before)
-        if calmer and loses_nothing(way, before, confidence=contest.config.confidence):
+        kept = way.smoother_than(before) and costs_little(way, before)
+        if self.choice.acting == "planner":
+            kept |= loses_nothing(way, before, confidence=contest.config.confidence)
+        if kept:
             self.kept = name
             return False
         return self._try_next()
@@ -92,7 +98,7 @@ class CatchTrial:
             "chatter_before": before.mean_chatter,
         }
 
-    def made(self, record: Mapping[str, Any] | None) -> Catch | None:
+    def made(self, record: Mapping[str, Any] | None) -> Catch | Settle | None:
         """The regulator of a record."""
         return None if record is None else self._catch(record["way"])
 
@@ -121,15 +127,16 @@ class CatchTrial:
         return True
 
     @cached_property
-    def _widest(self) -> Catch | None:
-        """The regulator that catches the model at the task's goal from furthest, if any does."""
+    def _widest(self) -> Catch | Settle | None:
+        """The regulator that takes over from furthest, at the goal or on a reference, if any."""
         agent = self.contest.agent
         assert agent.dynamics is not None
+        sort: type[Catch | Settle] = Catch if agent.task.reference is None else Settle
         try:
-            made = Catch.from_model(agent.task, agent.dynamics)
+            made = sort.from_model(agent.task, agent.dynamics)
         except ConfigError:  # there is no goal to stay in
             return None
         return made.to(self.contest.starts.device)
 
-    def _catch(self, name: str) -> Catch | None:
+    def _catch(self, name: str) -> Catch | Settle | None:
         return None if self._widest is None else self._widest.closer(_SHARES[name])

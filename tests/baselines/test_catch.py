@@ -58,7 +58,7 @@ def test_it_is_built_again_from_its_config_and_buffers():
 def test_a_config_of_another_task_is_refused(moved):
     task = get_task("pendulum")
     with pytest.raises(ConfigError, match="moved: expected"):
-        Catch.from_config(task, {"moved": moved})
+        Catch.from_config(task, {"kind": "goal", "moved": moved})
 
 
 def test_no_goal_no_catch():

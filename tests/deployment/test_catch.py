@@ -9,10 +9,13 @@ import torch
 from tensordict import TensorDict
 
 from phihp_torchrl import Agent, get_task, load_agent, save_agent
-from phihp_torchrl.baselines import Catch
+from phihp_torchrl.baselines import Catch, Settle
 from phihp_torchrl.deployment import AgentError, ExportedAgent, PlanModule
+from phihp_torchrl.evaluation import evaluate
+from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
+from tests.followed import followed
 
-from .agent_parts import SMALL, edit_weights, make_agent
+from .agent_parts import SMALL, edit_json, edit_weights, make_agent
 
 TASK = get_task("pendulum-swingup")
 NEAR, FAR = torch.tensor([0.01, 0.0]), torch.tensor([3.0, 0.0])
@@ -120,10 +123,62 @@ def test_an_observation_of_another_shape_is_an_error_that_says_so(agent, shape):
 def test_an_exported_plan_has_the_regulator(agent):
     module = PlanModule(agent)
     noise = torch.randn(module.noise_shape)
-    near = module(TASK.observe(NEAR), noise)
+    near, far = module(TASK.observe(NEAR), noise), module(TASK.observe(FAR), noise)
+    assert not torch.allclose(far, agent.catch.act(FAR))
     assert torch.allclose(near, agent.catch.act(NEAR))
     exported = ExportedAgent(module, TASK, module.noise_shape)
     torch.manual_seed(0)
     far = exported(TensorDict(observation=TASK.observe(FAR)))["action"]
     torch.manual_seed(0)
     assert torch.equal(far, agent(TensorDict(observation=TASK.observe(FAR)))["action"])
+
+
+def test_a_regulator_of_an_unknown_kind_is_refused(agent, tmp_path):
+    save_agent(agent, tmp_path)
+    edit_json(tmp_path, lambda content: content["catch"].update(kind="other"))
+    with pytest.raises(AgentError, match=r"catch\.kind: expected one of \['goal', 'settle'\]"):
+        load_agent(tmp_path)
+
+
+@pytest.fixture
+def follower() -> Agent:
+    torch.manual_seed(0)
+    task = followed(max_steps=60)
+    made = make_agent(task, replace(SMALL, warm_start=True))
+    made.catch = Settle.from_model(task, made.dynamics)
+    return made
+
+
+def standing(task, position, reference, *, starts=False):
+    state = task.with_signals(
+        task.at_rest(torch.tensor([[position, 0.0]])), torch.tensor([[reference]])
+    )
+    return TensorDict(
+        observation=task.observe(state), is_init=torch.tensor([[starts]]), batch_size=[1]
+    )
+
+
+def test_on_a_reference_that_stands_still_the_regulator_acts(follower, tmp_path):
+    save_agent(follower, tmp_path)
+    loaded = load_agent(tmp_path, task=follower.task)
+    for agent in (follower, loaded):
+        torch.manual_seed(0)
+        first = agent(standing(agent.task, 0.5, 0.3, starts=True))["action"].clone()
+        second = agent(standing(agent.task, 0.32, 0.3))["action"]
+        assert torch.allclose(second, first, atol=1e-4), "it goes on from what was sent"
+        assert agent.catch._near.item()
+        assert not agent(standing(agent.task, 0.32, -0.3)).is_empty()
+        assert not agent.catch._near.item()
+        agent.reset()
+        assert agent.catch._sent is None
+
+
+def test_a_follower_is_exported_without_it_and_says_so(follower, caplog):
+    assert PlanModule(follower).catch is None
+    assert "stands still has a memory, and is left out" in caplog.text
+
+
+def test_an_agent_with_it_plays_whole_episodes(follower):
+    world = SimulatedWorld(follower.task, SimulatedConfig())
+    found = evaluate(follower, follower.task, episodes=3, seed=1, world=world)
+    assert found.returns.isfinite().all()

@@ -10,11 +10,13 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 
 from phihp_torchrl import Agent, HybridDynamics, get_task
+from phihp_torchrl.baselines import Settle
 from phihp_torchrl.evaluation import evaluate
 from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.tasks import Box
 from phihp_torchrl.trainers import CalibratePhase, calibrate_catch
 from phihp_torchrl.trainers.calibrate_rule import Way, loses_nothing
+from tests.followed import followed
 
 from .calibrate_parts import TINY, finished
 
@@ -69,6 +71,7 @@ def test_a_regulator_that_earns_less_is_not_kept(monkeypatch):
         return loses_nothing(replace(way, returns=tuple(r - 10.0 for r in way.returns)), before)
 
     monkeypatch.setattr(calibrate_catch, "loses_nothing", judge)
+    monkeypatch.setattr(calibrate_catch, "costs_little", lambda way, before: False)
     phase = finished(make_agent(), CATCHING)
     tried = [name for name in phase.final["ways"] if name.startswith("caught")]
     assert tried == ["caught", "caught close"]
@@ -88,6 +91,18 @@ def test_none_is_tried_where_the_agent_rests(monkeypatch):
     monkeypatch.setattr(Way, "mean_chatter", property(lambda self: 0.0))
     phase = finished(make_agent(), CATCHING)
     assert not [name for name in phase.final["ways"] if name.startswith("caught")]
+
+
+def test_on_a_reference_it_is_tried_also_where_the_agent_rests(monkeypatch):
+    monkeypatch.setattr(Way, "mean_chatter", property(lambda self: 0.0))
+    task = followed()
+    actor = TensorDictModule(lambda seen: 0.0 * seen[..., :1], ["observation"], ["action"])
+    parts = {"dynamics": HybridDynamics.pure_prior(task), "actor": actor}
+    phase = finished(Agent(task, **parts, planner_config=RESTLESS), CATCHING)
+    assert "caught" in phase.final["ways"]
+    found = phase.parts()["catch"]
+    assert (found is None) == (phase.final["catch"] is None)
+    assert found is None or isinstance(found, Settle)
 
 
 @pytest.mark.parametrize("after", range(1, 6))
