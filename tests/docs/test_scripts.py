@@ -32,8 +32,15 @@ A worker is sent what a spawned one is, imports the script itself, and has seeds
 SEEDS = "import os, torch; os.register_at_fork(after_in_child=torch.seed)"
 
 
+ENDING = """
+    import gc
+    del collector
+    gc.collect()
+"""
+"""What the page says of the end of a script with an asynchronous collector."""
+
 TRIES = 2
-"""Of the asynchronous collector, which now and then gives no answer; why is not known."""
+"""Of the asynchronous collector, which now and then gives no answer."""
 
 
 def run(place: Path, *scripts: str) -> subprocess.CompletedProcess[str]:
@@ -61,7 +68,8 @@ def test_scripts_print_what_the_page_says(place: Path) -> None:
 def test_the_asynchronous_collector_does_the_same(place: Path) -> None:
     script = (place / "collect.py").read_text()
     assert "MultiSyncCollector" in script
-    (place / "collect_async.py").write_text(script.replace("MultiSync", "MultiAsync"))
+    script = script.replace("MultiSync", "MultiAsync") + ENDING
+    (place / "collect_async.py").write_text(script)
     for _ in range(TRIES):
         done = run(place, "collect_async.py")
         if done.returncode == 0 or "Timeout (" not in done.stderr:
