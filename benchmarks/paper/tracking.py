@@ -1,12 +1,15 @@
 """A motor's speed on a random reference: agents beside PI controllers and regulators.
 
     python benchmarks/paper/tracking.py --seeds 100 101
+    python benchmarks/paper/tracking.py --seeds 100 101 --only-calibrated
 
 Learns ``rigs/motor.py`` for each seed and each preview, from real steps of its simulated world. A
 PI controller, with a clamped integral, and an LQR with integral action, of that world's own
 equations, are tuned in that same world on an episode seed below 100: each once for the least RMS
 error and once for the highest return, which counts small errors more. Beside each agent plays an
-LQR as evaluations have it too, built in the agent's learned model and not tuned. All are then
+LQR as evaluations have it too, built in the agent's learned model and not tuned, and the agent as
+calibration leaves it today, with a regulator on a reference that stands still. With
+``--only-calibrated`` that one alone plays, and the results of others stay. All are then
 measured on episodes from 1,000,000 on: in the world as it is, with a constant torque of the load,
 and with another inertia, none of which anybody is told. Writes results/tracking/.
 """
@@ -24,11 +27,13 @@ from typing import Any
 
 import torch
 
-from phihp_torchrl import Agent, get_task, learn, load_agent, save_agent
+from phihp_torchrl import Agent, get_task, learn, load_agent, load_config, save_agent
 from phihp_torchrl.baselines import LQI
+from phihp_torchrl.config import read_kind, resolve_seconds
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
-from phihp_torchrl.trainers import import_plugins
+from phihp_torchrl.planners import PLANNERS
+from phihp_torchrl.trainers import CalibrateConfig, CalibratePhase, import_plugins
 from tracking_episodes import TASKS, measure
 from tuned_controllers import CRITERIA, LQR, TUNABLE, tune
 
@@ -87,9 +92,23 @@ def train(name: str, seed: int, updates: int, place: Path, models: Path | None =
     return kept
 
 
+def calibrated(agent: Agent, seed: int) -> Agent:
+    """The agent as calibration leaves it, from the settings of the planner that it is given."""
+    task, given = agent.task, load_config(agent.task.name)
+    config = resolve_seconds(read_kind(PLANNERS, given["planner"], "planner"), task.time_step)
+    parts = {name: getattr(agent, name) for name in ("dynamics", "actor", "qvalue")}
+    phase = CalibratePhase(
+        Agent(task, **parts, planner_config=config), CalibrateConfig(), seed=seed
+    )
+    while not phase.done:
+        phase.advance()
+    return Agent(task, **parts, **phase.parts())
+
+
 def write(result: Mapping[str, Any], results: Path) -> None:
     """Write the result of a task and seed, and the table of all so far."""
     name = f"{result['task']}-{result['seed']}" if result["seed"] is not None else result["task"]
+    name += result.get("part", "")
     results.mkdir(parents=True, exist_ok=True)
     (results / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
     every = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
@@ -116,7 +135,9 @@ def write(result: Mapping[str, Any], results: Path) -> None:
         "last second, its size on average and at most over the episodes; the ripple is the "
         f"standard deviation within that second. Controllers with a criterion in their names "
         f"are tuned by it in the world as it is ({gains}), an LQR of that world's own equations; "
-        "one with a seed is built in the learned model of that agent, and not tuned. Nobody is "
+        "one with a seed is built in the learned model of that agent, and not tuned. *Agent as "
+        "calibrated* is the agent as calibration leaves it, with a regulator where a reference "
+        "stands still if imagined episodes say so; *planner* are its plans alone. Nobody is "
         "told of other worlds. *motor-preview* knows the reference of the next five steps, which "
         "PI controllers and LQR have no use for.\n\n"
         f"{markdown_table(head, rows)}\n"
@@ -125,6 +146,48 @@ def write(result: Mapping[str, Any], results: Path) -> None:
     for row in rows:
         if row[0] == result["task"]:
             print(*row, sep=" | ", flush=True)
+
+
+def measure_controllers(episodes: int, tries: int, results: Path) -> None:
+    """Tune what needs no agent in the true world, measure it, and write."""
+    task = get_task("motor")
+    gains = {
+        f"{name}, {by}": tune(kind, task, episodes, criterion, tries)
+        for name, kind in TUNABLE.items()
+        for by, criterion in CRITERIA.items()
+    }
+    measured = {
+        name: measure(TUNABLE[name.split(", ")[0]].make(task, *found.values()), task, episodes)
+        for name, found in gains.items()
+    }
+    result = {
+        "task": "motor",
+        "seed": None,
+        "gains": gains,
+        "episodes": episodes,
+        "measured": measured,
+        "origin": describe_origin(0),
+    }
+    write(result, results)
+
+
+def measure_agent(agent: Agent, seed: int, episodes: int) -> dict[str, Any]:
+    """What the agent as it was saved, its parts and an LQR in its model do in each world."""
+    task, config = agent.task, agent.planner_config
+    assert config is not None
+    assert agent.dynamics is not None
+    plans = {
+        "planner": agent.with_planner(config),
+        "planner that settles": agent.with_planner(replace(config, **SETTLED)),
+    }
+    for each in plans.values():
+        each.catch = None  # a regulator that calibration chose is played beside them
+    acting: dict[str, Any] = {
+        **plans,
+        "actor": agent.actor_alone(),
+        LQR: LQI.from_model(task, agent.dynamics),
+    }
+    return {f"{name}, seed {seed}": measure(each, task, episodes) for name, each in acting.items()}
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -138,62 +201,36 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--agents", type=Path, default=AGENTS, help="where agents are kept")
     parser.add_argument("--models", type=Path, help="runs that have done the phase model")
+    parser.add_argument("--only-calibrated", action="store_true")
     arguments = parser.parse_args(words)
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     import_plugins([f"{RIGS / 'motor.py'}"])
     episodes = arguments.episodes
-    task = get_task("motor")
-    gains = {
-        f"{name}, {by}": tune(kind, task, episodes, criterion, arguments.tries)
-        for name, kind in TUNABLE.items()
-        for by, criterion in CRITERIA.items()
-    }
-    measured = {
-        name: measure(TUNABLE[name.split(", ")[0]].make(task, *found.values()), task, episodes)
-        for name, found in gains.items()
-    }
-    write(
-        {
-            "task": "motor",
-            "seed": None,
-            "gains": gains,
-            "episodes": episodes,
-            "measured": measured,
-            "origin": describe_origin(0),
-        },
-        arguments.results,
-    )
+    if not arguments.only_calibrated:
+        measure_controllers(episodes, arguments.tries, arguments.results)
     for seed in arguments.seeds:
         for name in arguments.tasks:
             agent = train(name, seed, arguments.updates, arguments.agents, arguments.models)
-            task, config = get_task(name), agent.planner_config
-            assert config is not None
-            assert agent.dynamics is not None
-            settled = agent.with_planner(replace(config, **SETTLED))
-            measured = {
-                f"planner, seed {seed}": measure(agent, task, episodes),
-                f"planner that settles, seed {seed}": measure(settled, task, episodes),
-                f"actor, seed {seed}": measure(agent.actor_alone(), task, episodes),
-                f"{LQR}, seed {seed}": measure(
-                    LQI.from_model(task, agent.dynamics), task, episodes
-                ),
+            common = {
+                "task": name,
+                "seed": seed,
+                "seconds": agent.metadata["seconds"],
+                "updates": arguments.updates,
+                "settings": SETTINGS,
+                "episodes": episodes,
+                "origin": describe_origin(seed),
             }
-            write(
-                {
-                    "task": name,
-                    "seed": seed,
-                    "seconds": agent.metadata["seconds"],
-                    "updates": arguments.updates,
-                    "settings": SETTINGS,
-                    "settled": SETTLED,
-                    "calibration": agent.metadata.get("calibration"),
-                    "episodes": episodes,
-                    "measured": measured,
-                    "origin": describe_origin(seed),
-                },
-                arguments.results,
-            )
+            if not arguments.only_calibrated:
+                measured = measure_agent(agent, seed, episodes)
+                chosen = agent.metadata.get("calibration")
+                parts = {"settled": SETTLED, "calibration": chosen, "measured": measured}
+                write({**common, **parts}, arguments.results)
+            ours = calibrated(agent, seed)
+            measured = {f"agent as calibrated, seed {seed}": measure(ours, agent.task, episodes)}
+            chosen = ours.metadata["calibration"]
+            parts = {"part": "-calibrated", "calibration": chosen, "measured": measured}
+            write({**common, **parts}, arguments.results)
 
 
 if __name__ == "__main__":

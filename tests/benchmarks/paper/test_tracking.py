@@ -13,12 +13,16 @@ from phihp_torchrl import Agent, HybridDynamics, get_task
 from phihp_torchrl.agents import Actor
 from phihp_torchrl.baselines import LQI
 from phihp_torchrl.planners import CEMConfig
-from phihp_torchrl.trainers import import_plugins
+from phihp_torchrl.trainers import CalibrateConfig, import_plugins
 
 
 @pytest.fixture(scope="module", autouse=True)
 def rig():
     import_plugins([str(tracking.RIGS / "motor.py")])
+
+
+NUMBERS = {"planning_horizon": 2, "num_candidates": 8, "top_k": 2, "num_policy_candidates": 1}
+SEARCH = {"kind": "cem", **NUMBERS}
 
 
 def test_an_lqr_in_the_prior_keeps_its_speed_in_every_world() -> None:
@@ -36,12 +40,13 @@ def test_all_are_measured_in_the_same_worlds(tmp_path, monkeypatch) -> None:
         task,
         dynamics=HybridDynamics.pure_prior(task),
         actor=Actor(task),
-        planner_config=CEMConfig(
-            planning_horizon=2, num_candidates=8, top_k=2, num_policy_candidates=1
-        ),
+        planner_config=CEMConfig(**NUMBERS),
         metadata={"seconds": 1.0},
     )
     monkeypatch.setattr(tracking, "train", lambda *arguments: agent)
+    few = CalibrateConfig(episodes=2, max_episodes=2, budget=1)
+    monkeypatch.setattr(tracking, "CalibrateConfig", lambda: few)
+    monkeypatch.setattr(tracking, "load_config", lambda name: {"planner": SEARCH})
     play = tracking_episodes.play
 
     def short(*arguments, steps=None, **options):
@@ -64,6 +69,14 @@ def test_all_are_measured_in_the_same_worlds(tmp_path, monkeypatch) -> None:
     ]
     for found in (*tuned["measured"].values(), *beside["measured"].values()):
         assert found.keys() == tracking_episodes.WORLDS.keys()
+    again = json.loads((tmp_path / "motor-100-calibrated.json").read_text())
+    assert again["calibration"]["acting"] in ("planner", "actor")
+    (found,) = again["measured"].values()
+    assert found.keys() == tracking_episodes.WORLDS.keys()
+    (tmp_path / "motor-100-calibrated.json").unlink()
+    tracking.main([*words, "--only-calibrated"])
+    assert (tmp_path / "motor-100-calibrated.json").is_file()
     page = (tmp_path / "README.md").read_text()
+    assert "| motor | agent as calibrated, seed 100 | load of 0.2 Nm |" in page
     assert "effort = 0.1" in page or "effort = 0.01" in page
     assert "| motor | LQR with integral action, seed 100 | load of 0.2 Nm |" in page
