@@ -2,10 +2,10 @@
 
     python benchmarks/paper/plateau.py
 
-Replays the imagined returns that results/runs has of default runs through the rule by which the
-policy phase ends, for several values of ``policy.patience`` and ``policy.tail``. A kept run has the
-mean of its returns alone. So every rise of more than 0.1 % counts here, where a run asks for two
-standard errors as well and may end earlier; and rates do not fall early in a replay.
+Replays the imagined returns that results/runs-0.1.0 has of default runs through the rule by which
+the policy phase ends, for several values of ``policy.patience`` and ``policy.tail``. A kept run has
+the mean of its returns alone. So every rise of more than 0.1 % counts here, where a run asks for
+two standard errors as well and may end earlier; and rates do not fall early in a replay.
 Writes results/plateau/README.md.
 """
 
@@ -26,7 +26,7 @@ from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
 from phihp_torchrl.trainers import Plateau, PolicyConfig, Schedule
 
-RUNS, RESULTS = Path("results/runs"), Path("results/plateau")
+RUNS, RESULTS = Path("results/runs-0.1.0"), Path("results/plateau")
 DEFAULT = (PolicyConfig.patience, PolicyConfig.tail)
 TRIED = ((0.2, 0.1), (0.3, 0.15), DEFAULT)
 

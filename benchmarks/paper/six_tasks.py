@@ -1,14 +1,14 @@
 r"""What a user of the defaults gets on the six tasks: returns, smoothness, and the time it takes.
 
-    python benchmarks/paper/run_grid.py seed=101,102 results=results/six_tasks \
+    python benchmarks/paper/run_grid.py proof=true 'seed=range(140,150)' share=0.5 \
         task=pendulum,pendulum-swingup,cartpole,cartpole-swingup,acrobot,acrobot-swingup
     python benchmarks/paper/six_tasks.py
 
-Reads the kept runs of default settings with training seeds from 100 on, and writes
-results/six_tasks/README.md beside them, and the first columns into README.md; the runs in
-results/runs are of version 0.1.0. It runs nothing and chooses nothing. Means are over training
-seeds, and so are their intervals: episodes of one seed share their agent, so that a seed counts
-once.
+Reads the kept runs of default settings with training seeds from 100 on, those of the last proof,
+and writes a README.md beside them, and the first columns into README.md. With ``--results`` it
+reads others, and leaves README.md alone. It runs nothing and chooses nothing. Means are over
+training seeds, and so are their intervals: episodes of one seed share their agent, so that a seed
+counts once.
 """
 
 from __future__ import annotations
@@ -23,14 +23,12 @@ from statistics import median
 from measures import agent_in, paired_difference_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, markdown_table
 from report.cells import configurations
-from report.overview import origins, put_between
+from report.overview import END, START, origins, put_between
 from report.runs import Run, read_runs
 
-RESULTS = Path("results/six_tasks")
+RESULTS = Path("results/runs")
 TASKS = ("pendulum", "pendulum-swingup", "cartpole", "cartpole-swingup", "acrobot",
          "acrobot-swingup")  # fmt: skip
-START, END = "<!-- six-tasks:start -->", "<!-- six-tasks:end -->"
-"""Between these README.md has its table."""
 _AIMS = json.loads((Path(__file__).parent / "aims.json").read_text())["tasks"]
 AIMS = {task: float(aim["return"]) for task, aim in _AIMS.items()}
 """Mean returns of version 0.1.0, below which none should fall; the file says of which runs."""

@@ -26,7 +26,7 @@ from phihp_torchrl.worlds import SimulatedConfig, SimulatedWorld
 
 from .run_parts import CONFIG, with_sections
 
-COMMITTED = sorted((Path(__file__).parents[2] / "results" / "runs").iterdir())
+COMMITTED = sorted((Path(__file__).parents[2] / "results" / "runs-0.1.0").iterdir())
 
 
 def request(*words: str) -> RunRequest:

@@ -55,7 +55,7 @@ class ReportConfig:
     any_version: bool = False
     reps: int = 2000
     overview: str | None = "results/README.md"
-    page: str | None = "README.md"
+    page: str | None = None
     plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -70,9 +70,10 @@ def test_time_to_the_published_return_is_that_of_the_first_actor_to_earn_it(tmp_
 
 def test_aims_are_the_returns_of_the_runs_that_their_file_names():
     source = json.loads((ROOT / "benchmarks" / "paper" / "aims.json").read_text())
-    assert "results/runs/<task>-default-n<real_steps>-seed<0-4>" in source["source"]
+    assert "results/runs-0.1.0/<task>-default-n<real_steps>-seed<0-4>" in source["source"]
+    kept = ROOT / "results" / "runs-0.1.0"
     for task, aim in source["tasks"].items():
         names = (f"{task}-default-n{aim['real_steps']}-seed{seed}" for seed in range(5))
-        runs = [read_run(ROOT / "results" / "runs" / name, any_version=True) for name in names]
+        runs = [read_run(kept / name, any_version=True) for name in names]
         mean = sum(run.acting[agent_in(run.acting)].mean for run in runs) / len(runs)
         assert round(mean, 1) == six_tasks.AIMS[task]
