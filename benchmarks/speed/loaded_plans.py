@@ -90,7 +90,7 @@ def measure(task: str, place: Path, *, written_out: bool) -> dict[str, Any] | No
     for i in range(ROUNDS + 1):
         observations = eager.task.observe(eager.task.sample_start([IN_A_TURN], generator))
         for name, agent in agents.items():
-            first, *after = [1e3 * seconds(agent, each) for each in observations]
+            first, *after = [1e3 * timed(agent, each) for each in observations]
             if i:  # the first round of all is for what is built at a first call
                 times["first"][name].append(first)
                 times["after"][name].append(statistics.median(after))
@@ -106,7 +106,7 @@ def measure(task: str, place: Path, *, written_out: bool) -> dict[str, Any] | No
     return row
 
 
-def seconds(agent: Any, observation: torch.Tensor) -> float:
+def timed(agent: Any, observation: torch.Tensor) -> float:
     """The thread's seconds of one action."""
     seen = TensorDict(observation=observation)
     start = time.thread_time()
