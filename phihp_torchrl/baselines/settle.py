@@ -22,6 +22,8 @@ _REACH = 0.1
 """Error within which the regulator takes over, in half-ranges of the reference."""
 _MOST_ROWS = 1000
 """Values of a component of a reference at which a file may say that the model rests."""
+_PATIENCE = 5.0
+"""How many times as long as the regulator takes plans are waited for."""
 _LEAVE = 3.0
 """How many times as far it goes on, so that who acts does not change with every step."""
 
@@ -30,8 +32,10 @@ class Settle(nn.Module):
     """A regulator with integral action that takes over where a reference stands still.
 
     It acts where what is known of the reference is constant, since the step before and in the
-    preview, and its components are near it: within a tenth of its half-range, and three times as
-    far once it acts. So plans turn and look ahead, and the integral leaves no steady error, also
+    preview, and its components are near it: within a tenth of its half-range, or a share of that,
+    and three times as far once it acts. Where the reference has stood still for five times as long
+    as the regulator takes, and plans have not come that near, it acts within the whole tenth. So
+    plans turn and look ahead, and the integral leaves no steady error, also
     under a load that nobody measures. It begins with the integral by which its action is the one
     that was sent last (bumpless transfer; :class:`~phihp_torchrl.baselines.LQI` is the regulator).
 
@@ -65,6 +69,8 @@ class Settle(nn.Module):
     gain: Tensor
     cost: Tensor
     reach: Tensor
+    tenth: Tensor
+    wait: Tensor
 
     def __init__(self, task: Task, moved: Sequence[int] = (), rows: Sequence[int] = ()) -> None:
         super().__init__()
@@ -78,12 +84,15 @@ class Settle(nn.Module):
             "gain": [actions, size + count],
             "cost": [size + count, size + count],
             "reach": [count],
+            "tenth": [count],
+            "wait": [],
             **{f"values_{i}": [n] for i, n in enumerate(self.rows)},
             **{f"shifts_{i}": [n, physical + actions] for i, n in enumerate(self.rows)},
         }
         for name, shape in shapes.items():
             self.register_buffer(name, torch.zeros(shape))
         self._before: Tensor | None = None
+        self._stood: Tensor | None = None
         self._near: Tensor | None = None
         self._sent: Tensor | None = None
         self._built: list[LQI] = []  # in a list, so that its buffers are not this module's
@@ -112,6 +121,8 @@ class Settle(nn.Module):
             "gain": torch.as_tensor(lqi.regulator.gain),
             "cost": torch.as_tensor(lqi.regulator.cost),
             "reach": share * _REACH * half,
+            "tenth": _REACH * half,
+            "wait": torch.tensor(_PATIENCE * max(lqi.times) / task.time_step),
             **{f"values_{i}": values for i, values in enumerate(table.values)},
             **{f"shifts_{i}": shifts for i, shifts in enumerate(table.shifts)},
         }
@@ -139,13 +150,17 @@ class Settle(nn.Module):
         was_near = torch.zeros_like(fresh) if self._near is None else self._near & ~fresh
         ahead = known.unflatten(-1, (-1, len(self.places))) == wanted.unsqueeze(-2)
         still = ahead.flatten(-2).all(-1) & ((before == wanted).all(-1) | fresh)
-        error = (physical[..., self.places] - wanted).abs() / self.reach.to(state)
-        near = still & (error.amax(-1) <= torch.where(was_near, _LEAVE, 1.0))
+        stood = torch.zeros(batch, device=state.device) if self._stood is None else self._stood
+        stood = torch.where(still & ~fresh, stood + 1.0, 0.0)
+        error = (physical[..., self.places] - wanted).abs()
+        close, tenth = ((error / far.to(state)).amax(-1) for far in (self.reach, self.tenth))
+        near = (close <= torch.where(was_near, _LEAVE, 1.0)) | (was_near & (tenth <= 1.0))
+        near = still & (near | ((tenth <= 1.0) & (stood > self.wait.to(stood))))
         lqi, new = self._regulator, near & ~was_near
         if self._sent is not None and self._sent.shape[:-1] == batch:
             lqi.go_on_from(state, self._sent.to(state), new & ~fresh)
         action = task.clip_action(lqi.act(state, new if self._sent is None else new & fresh))
-        self._before, self._near = wanted, near
+        self._before, self._stood, self._near = wanted, stood, near
         return near, action
 
     def follow(self, sent: Tensor) -> None:
@@ -154,7 +169,7 @@ class Settle(nn.Module):
 
     def reset(self) -> None:
         """Forget the episode."""
-        self._before = self._near = self._sent = None
+        self._before = self._stood = self._near = self._sent = None
         self._built = []
 
     def closer(self, share: float) -> Settle:

@@ -46,6 +46,18 @@ def test_it_takes_over_within_a_tenth_and_goes_on_three_times_as_far(task, settl
     assert not near(settle, at(task, 1.59, 1.0)), "it has left"
 
 
+def test_it_waits_for_plans_that_do_not_come_near_and_then_acts_from_farther_away(task, settle):
+    close = settle.closer(0.1)
+    wait = int(close.wait.item())
+    assert wait == int(5 * LQI.from_model(task, prior_of(task)).times[0] / task.time_step)
+    acts = [near(close, at(task, 1.1, 1.0)) for _ in range(wait + 3)]
+    assert acts == [False] * (wait + 1) + [True] * 2
+    assert near(close, at(task, 1.15, 1.0)), "it goes on"
+    assert not near(close, at(task, 1.25, 1.0))
+    assert not near(close, at(task, 1.1, 0.95)), "the reference has moved"
+    assert not near(close, at(task, 1.1, 0.95))
+
+
 def test_it_leaves_a_reference_that_moves(task, settle):
     assert near(settle, at(task, 1.0, 1.0))
     assert not near(settle, at(task, 1.0, 1.01))
