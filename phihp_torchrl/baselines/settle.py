@@ -35,9 +35,9 @@ class Settle(nn.Module):
     preview, and its components are near it: within a tenth of its half-range, or a share of that,
     and three times as far once it acts. Where the reference has stood still for five times as long
     as the regulator takes, and plans have not come that near, it acts within the whole tenth. So
-    plans turn and look ahead, and the integral leaves no steady error, also
-    under a load that nobody measures. It begins with the integral by which its action is the one
-    that was sent last (bumpless transfer; :class:`~phihp_torchrl.baselines.LQI` is the regulator).
+    plans turn and look ahead, and the integral leaves no steady error, also under a load that
+    nobody measures. It begins with the integral by which its action is the one that was sent last
+    (bumpless transfer; :class:`~phihp_torchrl.baselines.LQI` is the regulator).
 
     Its numbers are buffers, so it is saved with an agent's weights. It has a memory:
     :meth:`reset` is for the start of an episode, and :meth:`follow` tells it what was sent.
