@@ -119,6 +119,7 @@ class Agent(TensorDictModuleBase):
         elif actor is None:
             raise ConfigError("actor", "expected one for an agent that does not plan, got None.")
         remembers = self.planner is not None and self.planner.receding is not None
+        remembers |= isinstance(catch, Settle)
         if remembers or self._memory is not None:
             self.in_keys.append("is_init")
 
@@ -203,13 +204,12 @@ class Agent(TensorDictModuleBase):
     def _hold(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Plan, but where the regulator acts; where it does in all rows, no plan is sought."""
         assert self.catch is not None
-        observation = tensordict.get("observation", None)
-        if observation is None or observation.shape[-1:] != (self.task.observation_dim,):
-            return self._plan(tensordict)  # which says what is wrong
+        assert self.planner is not None
+        self.planner.check(tensordict)
         starts = tensordict.get("is_init", None)
         if starts is not None:
             starts = starts.reshape(tensordict.batch_size)
-        near, held = self.catch.take(self.task.locate(observation), starts)
+        near, held = self.catch.take(self.task.locate(tensordict["observation"]), starts)
         missed = 1
         if not near.all() or (starts is not None and starts.any()):
             planned, missed = self._plan(tensordict)["action"], 0

@@ -171,7 +171,7 @@ class CEMPlanner(SamplingPlanner):
         Returns:
             Actions ``[*batch, H, m]``, in bounds, and score ``[*batch]``.
         """
-        self._check_observation(tensordict)
+        self.check(tensordict)
         batch = tensordict.batch_size
         shape = self.settings.noise_shape(tuple(batch), self._action_low.numel())
         if noise is None:

@@ -223,7 +223,7 @@ class MPPIPlanner(SamplingPlanner):
                 of the bounds.
             last: the action before, ``[*batch, m]``, for ``change_cost``; NaN where there is none.
         """
-        self._check_observation(tensordict)
+        self.check(tensordict)
         if noise is None:
             noise = self.draw_noise(tensordict.batch_size)
         beta = self.settings.noise_beta

@@ -395,5 +395,6 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
         low = self._action_low
         return torch.randn(shape, generator=self.generator, dtype=low.dtype, device=low.device)
 
-    def _check_observation(self, tensordict: TensorDictBase) -> None:
+    def check(self, tensordict: TensorDictBase) -> None:
+        """Raise a ValueError for an observation that is missing, not finite, or of another form."""
         check_observation(self, tensordict, self._expected, self._action_low.device)

@@ -120,6 +120,15 @@ def test_an_observation_of_another_shape_is_an_error_that_says_so(agent, shape):
         agent(given)
 
 
+@pytest.mark.parametrize(
+    "observation", [torch.full((1, 3), torch.nan), torch.ones(1, 3, dtype=torch.float64)]
+)
+def test_the_regulator_is_not_asked_about_an_observation_that_a_plan_refuses(agent, observation):
+    agent(seen(NEAR, starts=[True]))
+    with pytest.raises(ValueError, match="observation"):
+        agent(TensorDict(observation=observation, batch_size=[1]))
+
+
 def test_an_exported_plan_has_the_regulator(agent):
     module = PlanModule(agent)
     noise = torch.randn(module.noise_shape)
