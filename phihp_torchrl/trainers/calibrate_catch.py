@@ -23,8 +23,9 @@ class CatchTrial:
     one, which takes over from as far away as it arrives, or from a tenth of that cost-to-go
     (:class:`~phihp_torchrl.baselines.Catch`); on a reference, from near it where it stands still
     (:class:`~phihp_torchrl.baselines.Settle`). The first by which the agent loses nothing is kept,
-    or no more than its smoothness may cost; where the actor is to act, it belongs to the plan,
-    which has to be smoother than the actor.
+    or no more than its smoothness may cost, or on a reference its steadiness: 1 % of the return.
+    Where the actor is to act, it belongs to the plan, which has to be smoother than the actor or
+    follow a reference.
 
     Args:
         contest: the episodes, of which the ways to plan have played.
@@ -45,21 +46,27 @@ class CatchTrial:
             doubted: whether other models disagree, so that a regulator of this one is not tried.
         """
         self.settled = choice, self.contest.episodes
-        follows = self.contest.agent.task.reference is not None
-        restless = follows or self.before.mean_chatter > RESTS
+        restless = self._follows or self.before.mean_chatter > RESTS
         return not doubted and restless and self._try_next()
 
     def judge(self) -> bool:
         """Compare what has played with the agent without it; whether there is more to play."""
         contest, (name,) = self.contest, self.contest.playing
         way, before = contest.way(name), self.before
-        kept = way.smoother_than(before) and costs_little(way, before)
+        if self._follows:  # imagination knows every load, and a regulator is for those unknown
+            kept = costs_little(way, before, steadier=True)
+        else:
+            kept = way.smoother_than(before) and costs_little(way, before)
         if self.choice.acting == "planner":
             kept |= loses_nothing(way, before, confidence=contest.config.confidence)
         if kept:
             self.kept = name
             return False
         return self._try_next()
+
+    @property
+    def _follows(self) -> bool:
+        return self.contest.agent.task.reference is not None
 
     @property
     def choice(self) -> Choice:

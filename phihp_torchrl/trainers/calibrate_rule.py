@@ -181,14 +181,19 @@ def in_doubt(own: Way, others: Sequence[Way], *, confidence: float = 2.0) -> boo
     return any(abs(gap) > max(least, confidence * error) for gap, error in gaps)
 
 
-def costs_little(way: Way, best: Way) -> bool:
+def costs_little(way: Way, best: Way, *, steadier: bool = False) -> bool:
     """Whether a way earns as much as the best, but for what its smoothness may cost.
 
     That is 0.3 % of the return, or 1 % where it rests and the best does not; and a standard error
     more, at most as much again, for one that rests.
+
+    Args:
+        way: what the way earned.
+        best: what the best has earned.
+        steadier: whether it is worth as much as rest for another reason.
     """
-    rests = way.mean_chatter <= RESTS
-    share = _REST if rests and best.mean_chatter > RESTS else _TRIFLE
+    rests = steadier or way.mean_chatter <= RESTS
+    share = _REST if rests and (steadier or best.mean_chatter > RESTS) else _TRIFLE
     allowed = share * abs(best.mean_return)
     ahead, error = way.ahead_of(best)
     return ahead >= -allowed - (min(error, allowed) if rests else 0.0)

@@ -71,7 +71,7 @@ def test_a_regulator_that_earns_less_is_not_kept(monkeypatch):
         return loses_nothing(replace(way, returns=tuple(r - 10.0 for r in way.returns)), before)
 
     monkeypatch.setattr(calibrate_catch, "loses_nothing", judge)
-    monkeypatch.setattr(calibrate_catch, "costs_little", lambda way, before: False)
+    monkeypatch.setattr(calibrate_catch, "costs_little", lambda way, before, **options: False)
     phase = finished(make_agent(), CATCHING)
     tried = [name for name in phase.final["ways"] if name.startswith("caught")]
     assert tried == ["caught", "caught close"]
