@@ -10,6 +10,7 @@ import pytest
 from grid_cells import ROOT
 from kept_runs import VERSION, make, make_run, table, text
 
+import six_tasks
 from phihp_torchrl.config import ConfigError
 from report import (
     NOT_RUN,
@@ -17,6 +18,12 @@ from report import (
     read_run,
     read_runs,
 )
+from report.claims import claims_section
+from report.main_table import main_table
+from report.overview import END, START
+from report.planned import read_planned
+from report.planner_and_actor import acting_section
+from report.results import Results
 
 COMMITTED = [ROOT / "results" / name for name in ("runs", "runs-0.1.0")]
 
@@ -126,3 +133,26 @@ def test_an_empty_folder_makes_a_report_of_what_was_not_run(tmp_path: Path, exis
     for path in (tmp_path / "report" / "tables").glob("*.csv"):
         assert ",," not in path.read_text().replace(",,\n", ",\n"), path
     assert "No runs yet." in (tmp_path / "overview.md").read_text()
+
+
+def test_the_committed_report_is_that_of_the_committed_runs() -> None:
+    place = ROOT / "results" / "runs"
+    found = read_runs(place, any_version=True).runs
+    chosen = [run for run in found if run.label == "default"]
+    results = Results(chosen, read_planned(place).of("default"))
+    sections = (
+        main_table(results),
+        claims_section(results),
+        acting_section(results.runs, results.planned),
+    )
+    for section in sections:
+        assert section.tables
+        for made in section.tables.values():
+            kept = ROOT / "results" / "report" / "tables" / f"{made.name}.csv"
+            assert kept.read_text() == made.csv(), f"{kept.name}: run `make report`"
+
+
+def test_the_table_of_the_readme_is_that_of_the_committed_runs() -> None:
+    found = read_runs(ROOT / "results" / "runs", any_version=True)
+    kept = (ROOT / "README.md").read_text().split(START)[1].split(END)[0]
+    assert kept.strip() == six_tasks.brief(found.runs).strip(), "run `make report`"
