@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -11,6 +12,8 @@ from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import RESTS
 from phihp_torchrl.trainers.calibrate_contest import Contest
 from phihp_torchrl.trainers.calibrate_rule import Choice, Way, costs_little, loses_nothing
+
+_log = logging.getLogger(__name__)
 
 # By name, shares of the level from which a regulator arrives; from far away it may take long.
 _SHARES = {"caught": 1.0, "caught close": 0.1}
@@ -142,6 +145,14 @@ class CatchTrial:
         try:
             made = sort.from_model(agent.task, agent.dynamics)
         except ConfigError:  # there is no goal to stay in
+            return None
+        except Exception as error:  # of a task's own functions, in double precision or for slopes
+            _log.warning(
+                "No regulator is tried near the goal, for none could be made: %s: %s. "
+                "calibrate.catch=false says so beforehand.",
+                type(error).__name__,
+                error,
+            )
             return None
         return made.to(self.contest.starts.device)
 

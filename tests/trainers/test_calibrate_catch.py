@@ -87,6 +87,19 @@ def test_none_is_tried_without_a_goal():
     assert phase.final["catch"] is None
 
 
+def test_a_task_whose_functions_know_one_precision_loses_no_run(caplog):
+    """Slopes are taken in double precision."""
+    weights = torch.tensor([1.0, 0.1])
+
+    def single(state, action, next_state):
+        return -(next_state.square() @ weights)
+
+    phase = finished(make_agent(reward=single), CATCHING)
+    assert phase.final["catch"] is None
+    assert "No regulator is tried near the goal, for none could be made" in caplog.text
+    assert "RuntimeError" in caplog.text
+
+
 def test_none_is_tried_where_the_agent_rests(monkeypatch):
     monkeypatch.setattr(Way, "mean_chatter", property(lambda self: 0.0))
     phase = finished(make_agent(), CATCHING)
