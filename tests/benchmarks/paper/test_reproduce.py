@@ -95,7 +95,7 @@ def test_a_cell_has_the_settings_that_its_grid_gave_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     keep(tmp_path, "acrobot-td3-default-seed0")
-    words = ("acrobot", "--method", "td3", "--overrides", "compile=false")
+    words = ("acrobot", "--method", "td3", "--seed", "0", "--overrides", "compile=false")
     config = asked_for(monkeypatch, tmp_path, *words)
     assert "td3.real_steps=300000" in config.words()
     assert "compile=false" in config.words()
