@@ -16,19 +16,19 @@ from phihp_torchrl.trainers.calibrate_rule import Choice, Way, costs_little, los
 _log = logging.getLogger(__name__)
 
 # By name, shares of the level from which a regulator arrives; from far away it may take long.
-_SHARES = {"caught": 1.0, "caught close": 0.1}
+_SHARES = {"caught": 1.0, "caught close": 0.1, "caught closer": 0.01, "caught closest": 0.001}
 
 
 class CatchTrial:
     """Lets the plan that was chosen play once more with a regulator near the goal.
 
     It does so where the agent does not come to rest, or follows a reference. The regulators are
-    one, which takes over from as far away as it arrives, or from a tenth of that cost-to-go
-    (:class:`~phihp_torchrl.baselines.Catch`); on a reference, from near it where it stands still
-    (:class:`~phihp_torchrl.baselines.Settle`). The first by which the agent loses nothing is kept,
-    or no more than its smoothness may cost, or on a reference its steadiness: 1 % of the return.
-    Where the actor is to act, it belongs to the plan, which has to be smoother than the actor or
-    follow a reference.
+    one, which takes over from as far away as it arrives, or from a tenth, a hundredth or a
+    thousandth of that cost-to-go (:class:`~phihp_torchrl.baselines.Catch`); on a reference, from
+    near it where it stands still (:class:`~phihp_torchrl.baselines.Settle`). The first by which the
+    agent loses nothing is kept, or no more than its smoothness may cost, or on a reference its
+    steadiness: 1 % of the return. Where the actor is to act, it belongs to the plan, which has to
+    be smoother than the actor or follow a reference.
 
     Args:
         contest: the episodes, of which the ways to plan have played.
