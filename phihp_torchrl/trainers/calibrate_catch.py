@@ -26,9 +26,10 @@ class CatchTrial:
     one, which takes over from as far away as it arrives, or from a tenth, a hundredth or a
     thousandth of that cost-to-go (:class:`~phihp_torchrl.baselines.Catch`); on a reference, from
     near it where it stands still (:class:`~phihp_torchrl.baselines.Settle`). The first by which the
-    agent loses nothing is kept, or no more than its smoothness may cost, or on a reference its
-    steadiness: 1 % of the return. Where the actor is to act, it belongs to the plan, which has to
-    be smoother than the actor or follow a reference.
+    agent loses nothing is kept. Where there is none, it is the one that earns most of those that
+    cost no more than smoothness may, or on a reference their steadiness: 1 % of the return. Where
+    the actor is to act, it belongs to the plan, which has to be smoother than the actor or follow a
+    reference.
 
     Args:
         contest: the episodes, of which the ways to plan have played.
@@ -55,17 +56,23 @@ class CatchTrial:
     def judge(self) -> bool:
         """Compare what has played with the agent without it; whether there is more to play."""
         contest, (name,) = self.contest, self.contest.playing
-        way, before = contest.way(name), self.before
-        if self._follows:  # imagination knows every load, and a regulator is for those unknown
-            kept = costs_little(way, before, steadier=True)
-        else:
-            kept = way.smoother_than(before) and costs_little(way, before)
-        if self.choice.acting == "planner":
-            kept |= loses_nothing(way, before, confidence=contest.config.confidence)
-        if kept:
+        confidence = contest.config.confidence
+        free = loses_nothing(contest.way(name), self.before, confidence=confidence)
+        if free and (self.choice.acting == "planner" or self._is_worth(name)):
             self.kept = name
             return False
-        return self._try_next()
+        if self._try_next():
+            return True
+        played = (name for name in _SHARES if contest.has_played(name) and self._is_worth(name))
+        self.kept = max(played, key=lambda each: contest.way(each).mean_return, default=None)
+        return False
+
+    def _is_worth(self, name: str) -> bool:
+        """Whether a regulator costs no more than its smoothness or its steadiness may."""
+        way, before = self.contest.way(name), self.before
+        if self._follows:  # imagination knows every load, and a regulator is for those unknown
+            return costs_little(way, before, steadier=True)
+        return way.smoother_than(before) and costs_little(way, before)
 
     @property
     def _follows(self) -> bool:

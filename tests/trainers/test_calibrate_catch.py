@@ -78,6 +78,15 @@ def test_a_regulator_that_earns_less_is_not_kept(monkeypatch):
     assert phase.final["catch"] is None
 
 
+def test_of_those_that_cost_a_little_the_one_that_earns_most_is_kept(monkeypatch):
+    monkeypatch.setattr(calibrate_catch, "loses_nothing", lambda way, before, **options: False)
+    monkeypatch.setattr(calibrate_catch, "costs_little", lambda way, before, **options: True)
+    phase = finished(make_agent(), CATCHING)
+    ways = {name: way for name, way in phase.final["ways"].items() if name.startswith("caught")}
+    assert len(ways) == 4
+    assert phase.final["catch"]["way"] == max(ways, key=lambda name: ways[name]["return"])
+
+
 def test_none_is_tried_without_a_goal():
     task = replace(get_task("acrobot"), max_steps=20)
     actor = TensorDictModule(lambda seen: 0.0 * seen[..., :1], ["observation"], ["action"])
