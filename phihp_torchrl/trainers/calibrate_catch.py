@@ -26,10 +26,9 @@ class CatchTrial:
     one, which takes over from as far away as it arrives, or from a tenth, a hundredth or a
     thousandth of that cost-to-go (:class:`~phihp_torchrl.baselines.Catch`); on a reference, from
     near it where it stands still (:class:`~phihp_torchrl.baselines.Settle`). The first by which the
-    agent loses nothing is kept. Where there is none, it is the one that earns most of those that
-    cost no more than smoothness may, or on a reference their steadiness: 1 % of the return. Where
-    the actor is to act, it belongs to the plan, which has to be smoother than the actor or follow a
-    reference.
+    agent loses nothing is kept; where the actor is to act, it belongs to the plan, which has to be
+    smoother besides. On a reference, where there is none, it is the one that earns most of those
+    that cost 1 % of the return at most: their steadiness is worth that.
 
     Args:
         contest: the episodes, of which the ways to plan have played.
@@ -55,24 +54,19 @@ class CatchTrial:
 
     def judge(self) -> bool:
         """Compare what has played with the agent without it; whether there is more to play."""
-        contest, (name,) = self.contest, self.contest.playing
-        confidence = contest.config.confidence
-        free = loses_nothing(contest.way(name), self.before, confidence=confidence)
-        if free and (self.choice.acting == "planner" or self._is_worth(name)):
+        contest, before, (name,) = self.contest, self.before, self.contest.playing
+        way, confidence = contest.way(name), contest.config.confidence
+        calmer = self.choice.acting == "planner" or way.smoother_than(before)
+        if calmer and loses_nothing(way, before, confidence=confidence):
             self.kept = name
             return False
         if self._try_next():
             return True
-        played = (name for name in _SHARES if contest.has_played(name) and self._is_worth(name))
-        self.kept = max(played, key=lambda each: contest.way(each).mean_return, default=None)
-        return False
-
-    def _is_worth(self, name: str) -> bool:
-        """Whether a regulator costs no more than its smoothness or its steadiness may."""
-        way, before = self.contest.way(name), self.before
         if self._follows:  # imagination knows every load, and a regulator is for those unknown
-            return costs_little(way, before, steadier=True)
-        return way.smoother_than(before) and costs_little(way, before)
+            ways = {each: contest.way(each) for each in _SHARES if contest.has_played(each)}
+            cheap = (each for each in ways if costs_little(ways[each], before, steadier=True))
+            self.kept = max(cheap, key=lambda each: ways[each].mean_return, default=None)
+        return False
 
     @property
     def _follows(self) -> bool:
