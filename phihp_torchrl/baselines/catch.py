@@ -28,14 +28,17 @@ _CART_EFFORTS = (10.0,)
 """Those for a cart: with cheap actions its regulator leans on learned friction."""
 
 
+_NONE = np.zeros((0, 0))
+"""In the place of matrices that a difference to a point does not need."""
+
+
 class Catch(nn.Module):
     r"""A regulator at the goal that takes over from another controller where it is near enough.
 
     It acts where the cost-to-go :math:`z^\top P z` of the regulator is below a level, by
     :math:`u = u_0 - K z`, and leaves all other states to whoever acted there. So plans have only to
-    come near the goal; there the regulator holds it, without the noise of a search and at a
-    thousandth of the cost (dual-mode control: Michalska and Mayne, 1993,
-    https://doi.org/10.1109/9.262032).
+    come near the goal; there the regulator holds it, without the noise of a search or its cost
+    (dual-mode control: Michalska and Mayne, 1993, https://doi.org/10.1109/9.262032).
 
     Goal, gain, cost and level are its buffers, so it is saved with an agent's weights.
 
@@ -105,7 +108,8 @@ class Catch(nn.Module):
 
     def take(self, state: Tensor, starts: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Where it acts, bool ``[*batch]``, and its action ``[*batch, m]``."""
-        return self.near(state), self.act(state)
+        error = self._error(state)
+        return self._is_near(error), self._action(error)
 
     def follow(self, sent: Tensor) -> None:
         """Do nothing: it acts by the state alone."""
@@ -115,17 +119,16 @@ class Catch(nn.Module):
 
     def near(self, state: Tensor) -> Tensor:
         """Whether it acts in a state of the task ``[*batch, n]``, bool ``[*batch]``."""
-        error = self._error(state)
-        return ((error @ self.cost.to(state)) * error).sum(-1) < self.level.to(state)
+        return self._is_near(self._error(state))
 
     def act(self, state: Tensor) -> Tensor:
         """Its action in a state ``[*batch, n]``, within its bounds, ``[*batch, m]``."""
-        action = self.keeping.to(state) - self._error(state) @ self.gain.to(state).mT
-        return self.task.clip_action(action)
+        return self._action(self._error(state))
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Its action ``[*batch, m]`` in states that are near, and ``action`` in all others."""
-        return torch.where(self.near(state).unsqueeze(-1), self.act(state), action)
+        near, own = self.take(state)
+        return torch.where(near.unsqueeze(-1), own, action)
 
     def closer(self, share: float) -> Catch:
         """The same regulator, which takes over at a share of the level."""
@@ -134,9 +137,14 @@ class Catch(nn.Module):
         return made.to(self.level.device)
 
     def _error(self, state: Tensor) -> Tensor:
-        none = np.zeros((len(self.at), len(self.at)))
-        point = LinearModel(self.task, self.at, self.keeping, none, none, self.moved)
+        point = LinearModel(self.task, self.at, self.keeping, _NONE, _NONE, self.moved)
         return point.difference(state)
+
+    def _is_near(self, error: Tensor) -> Tensor:
+        return ((error @ self.cost.to(error)) * error).sum(-1) < self.level.to(error)
+
+    def _action(self, error: Tensor) -> Tensor:
+        return self.task.clip_action(self.keeping.to(error) - error @ self.gain.to(error).mT)
 
     @property
     def config(self) -> dict[str, Any]:

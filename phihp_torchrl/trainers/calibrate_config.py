@@ -26,8 +26,9 @@ class CalibrateConfig:
             model whose step has over 60 tensor operations count more in proportion. Three episodes
             of three ways to plan and of the fast budget, and six of the one that is chosen, are
             played in any case.
-        catch: whether a linear-quadratic regulator may act near the task's goal in the place of
-            plans that do not come to rest there, if imagined episodes show that it loses nothing.
+        catch: whether a linear-quadratic regulator may act in the place of plans: near the task's
+            goal where they do not come to rest, if imagined episodes show that it loses nothing,
+            and on a reference that stands still, where it may cost 1 % of the return.
 
     Raises:
         ConfigError: for a value out of range; the message names the field.

@@ -64,8 +64,8 @@ def report(final: Mapping[str, Any]) -> None:
     )
     if (catch := final.get("catch")) is not None:
         _log.info(
-            "Near the goal a regulator acts in the place of plans: %+.4g ± %.2g in imagination "
-            "(chatter %.3f, and %.3f without it).",
+            "Near the goal or the reference a regulator acts, not plans: %+.4g ± %.2g in "
+            "imagination (chatter %.3f, and %.3f without it).",
             catch["gain"],
             catch["gain_error"],
             catch["chatter"],
