@@ -1,4 +1,4 @@
-"""How small networks can be, and at which learning rates: imagined return over CPU time.
+"""How small networks can be, and of which kind: imagined return over CPU time.
 
     python benchmarks/paper/networks.py --tasks cartpole-swingup --variants default 2x128 --seeds 20
     python benchmarks/paper/networks.py --only-write       # the tables of what there is
@@ -7,6 +7,9 @@ Trains actor and critics in the fitted models of the agents in results/agents, b
 settings but for those of the variant, and takes note of the imagined return over the seconds of CPU
 spent. No real step is taken and no real episode played: networks are chosen in imagination alone.
 Writes results/networks/{task}-{variant}-seed{seed}.json after every evaluation, and README.md.
+
+What stands between two layers is no setting of the package, whose networks have ReLU. A variant
+that has something else replaces it in this process alone.
 """
 
 from __future__ import annotations
@@ -15,15 +18,23 @@ import argparse
 import json
 import os
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from statistics import mean
+from typing import NamedTuple
+from unittest.mock import patch
 
 import torch
+from torch import Tensor
+from torch.nn import functional as F
 
 from phihp_torchrl import load_agent, load_config
+from phihp_torchrl.agents import Layers, equations, networks
 from phihp_torchrl.evaluation import TARGETS, markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
-from phihp_torchrl.trainers import PolicyTrainer, read_run_config
+from phihp_torchrl.trainers import PolicyTrainer, planned_acts, read_run_config
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/networks")
 
@@ -38,17 +49,61 @@ def widths(actor: list[int], critic: list[int], *rates: float) -> list[str]:
     ]
 
 
-VARIANTS: dict[str, list[str]] = {
-    "default": [],
-    "2x64": widths([64, 64], [64, 64], 1e-3, 2e-3),
-    "3x64": widths([64, 64], [64, 64, 64], 1e-3, 2e-3),
-    "2x96": widths([96, 96], [96, 96], 1e-3, 2e-3),
-    "2x128": widths([128, 128], [128, 128], 1e-3, 2e-3),
-    "2x128-slow": widths([128, 128], [128, 128]),
-    "3x128": widths([128, 128], [128, 128, 128], 1e-3, 2e-3),
-    "3x128-slow": widths([128, 128], [128, 128, 128], 5e-4, 1e-3),
-    "2x64-128": widths([64, 64], [128, 128], 1e-3, 2e-3),
+class Variant(NamedTuple):
+    """Settings that differ, and what stands between two layers."""
+
+    settings: list[str] = []
+    between: str = "relu"
+
+
+def _norm(values: Tensor) -> Tensor:
+    """Layer normalisation without weights of its own, then ReLU."""
+    return F.layer_norm(values, values.shape[-1:]).relu()
+
+
+BETWEEN = {"relu": torch.relu, "silu": F.silu, "tanh": torch.tanh, "norm": _norm}
+
+THREE_128 = widths([128, 128], [128, 128, 128], 1e-3, 2e-3)
+
+VARIANTS: dict[str, Variant] = {
+    "default": Variant(),
+    "2x64": Variant(widths([64, 64], [64, 64], 1e-3, 2e-3)),
+    "3x64": Variant(widths([64, 64], [64, 64, 64], 1e-3, 2e-3)),
+    "2x96": Variant(widths([96, 96], [96, 96], 1e-3, 2e-3)),
+    "2x128": Variant(widths([128, 128], [128, 128], 1e-3, 2e-3)),
+    "2x128-slow": Variant(widths([128, 128], [128, 128])),
+    "3x128": Variant(THREE_128),
+    "3x128-slow": Variant(widths([128, 128], [128, 128, 128], 5e-4, 1e-3)),
+    "2x64-128": Variant(widths([64, 64], [128, 128], 1e-3, 2e-3)),
+    "norm": Variant(between="norm"),
+    "3x128-norm": Variant(THREE_128, between="norm"),
+    "silu": Variant(between="silu"),
+    "tanh": Variant(between="tanh"),
+    "batch-128": Variant(["policy.batch_size=128"]),
 }
+
+
+@contextmanager
+def between_layers(name: str) -> Iterator[None]:
+    """Put this between the layers of all networks of the process, in the place of ReLU."""
+    if name == "relu":
+        yield
+        return
+    apply = BETWEEN[name]
+
+    def mlp(layers: Layers, inputs: Tensor) -> Tensor:
+        for weight, bias in zip(layers[:-2:2], layers[1:-2:2], strict=True):
+            inputs = apply(F.linear(inputs, weight, bias))
+        return F.linear(inputs, layers[-2], layers[-1])
+
+    def prepare(layers: Layers) -> Callable[[Tensor], Tensor]:
+        return partial(mlp, layers)
+
+    with ExitStack() as stack:
+        stack.enter_context(patch.object(equations, "mlp", mlp))
+        for module in (equations, networks, planned_acts):
+            stack.enter_context(patch.object(module, "prepare", prepare))
+        yield
 
 
 def train(
@@ -56,7 +111,8 @@ def train(
 ) -> None:
     """One policy phase in the model of the task's agent."""
     agent = load_agent(AGENTS / task)
-    config = read_run_config(load_config(task, overrides=VARIANTS[variant])).section("policy")
+    settings = VARIANTS[variant].settings
+    config = read_run_config(load_config(task, overrides=settings)).section("policy")
     torch.manual_seed(seed)
     assert agent.dynamics is not None  # of an agent that was trained in it
     trainer = PolicyTrainer(agent.task, agent.dynamics, config, seed=seed, compile=compile)
@@ -79,7 +135,8 @@ def train(
         record = {
             "task": task,
             "variant": variant,
-            "settings": VARIANTS[variant],
+            "settings": settings,
+            "between": VARIANTS[variant].between,
             "seed": seed,
             "done": trainer.done,
             "curve": curve,
@@ -96,8 +153,8 @@ def write_tables(results: Path) -> None:
     runs = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
     text = (
         "# Networks\n\nMade by `python benchmarks/paper/networks.py`. Do not edit. Returns are "
-        "imagined, of the best actor. Seconds are of CPU time, one thread, without those to the "
-        "first evaluation, in which everything is compiled.\n"
+        "imagined, of the best actor. Seconds are of CPU time, one thread, from the first "
+        "evaluation on. Nothing is compiled, as in runs by default.\n"
     )
     for task in TARGETS:
         mine = [run for run in runs if run["task"] == task and run["done"]]
@@ -141,10 +198,21 @@ def write_tables(results: Path) -> None:
         header += ["seconds to 98 % of the way", "seconds per 1,000 updates"]
         text += f"\n## {task}\n\n{markdown_table(header, table)}\n"
         text += f"\nNot finished, and left out: {', '.join(cut)}.\n" if cut else ""
+    used = {run["variant"] for run in runs}
     origins = sorted({origin_text(run["origin"]) for run in runs})
     text += "\n" + "; ".join(origins) + ".\n\nVariants: "
-    text += "; ".join(f"{k}: `{' '.join(v) or 'as set'}`" for k, v in VARIANTS.items()) + ".\n"
+    text += "; ".join(f"{name}: {_words(v)}" for name, v in VARIANTS.items() if name in used)
+    text += ".\n"
     (results / "README.md").write_text(text)
+
+
+def _words(variant: Variant) -> str:
+    """What differs from the default, in words."""
+    words = [f"`{' '.join(variant.settings)}`"] if variant.settings else []
+    if variant.between != "relu":
+        kind = "layer norm and ReLU" if variant.between == "norm" else variant.between
+        words.append(f"{kind} between layers")
+    return ", ".join(words) or "as set"
 
 
 def main() -> None:
@@ -153,7 +221,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[20])
-    parser.add_argument("--eager", action="store_true", help="without compiling")
+    parser.add_argument("--compile", action="store_true", help="as no default run does")
     parser.add_argument("--commit", help="of the code, where it is run outside its repository")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--only-write", action="store_true")
@@ -167,7 +235,8 @@ def main() -> None:
                 for variant in options.variants:
                     path = options.results / f"{task}-{variant}-seed{seed}.json"
                     if not (path.is_file() and json.loads(path.read_text())["done"]):
-                        train(task, variant, seed, path, not options.eager, options.commit)
+                        with between_layers(VARIANTS[variant].between):
+                            train(task, variant, seed, path, options.compile, options.commit)
     write_tables(options.results)
 
 
