@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import logging
-import os
 from pathlib import Path
 
 from phihp_torchrl.deployment import Agent, place_package
 from phihp_torchrl.trainers.context import Context
+from phihp_torchrl.trainers.idle import has_idle_core
 
 _log = logging.getLogger(__name__)
 
 # Seconds of training that earn a package, which takes another core half a minute.
 _EARNS = 60.0
-# The part of a core that is idle, at least, where one is to spare.
-_IDLE = 0.5
 # Seconds that the end of a run waits for a package.
 _PATIENCE = 300.0
 
@@ -66,18 +64,10 @@ def packages_plan(context: Context, agent: Agent) -> bool:
     on_cpu = all(tensor.device.type == "cpu" for tensor in agent.parameters())
     if seconds < _EARNS or context.compile or not on_cpu or not context.world.copies:
         return False
-    return _idle_cores(context.config.threads) >= _IDLE and _is_importable(context)
+    return has_idle_core(context.config.threads) and _is_importable(context)
 
 
 def _is_importable(context: Context) -> bool:
     """Whether another process finds what the task is made of, which no plugin or prompt has."""
     parts = (context.task.reward, type(context.task.system))
     return not context.config.plugins and all(part.__module__ != "__main__" for part in parts)
-
-
-def _idle_cores(threads: int) -> float:
-    """The cores that neither this process uses nor others did in the last minute."""
-    try:
-        return len(os.sched_getaffinity(0)) - max(threads, os.getloadavg()[0])
-    except (AttributeError, OSError):  # it is not known, as anywhere but on Linux
-        return 0.0

@@ -20,6 +20,7 @@ from phihp_torchrl.display import Progress
 from phihp_torchrl.dynamics import HybridDynamics, PreparedModel
 from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.trainers.checkpoints import clear_rotation, load_latest, load_state
+from phihp_torchrl.trainers.compile_ahead import CompileAhead, compiles_ahead
 from phihp_torchrl.trainers.compile_choice import earned, earned_by_step
 from phihp_torchrl.trainers.context import Context
 from phihp_torchrl.trainers.finite import check_finite
@@ -90,10 +91,13 @@ class RunLoop:
     def run(self) -> bool:
         """Do all phases; false if a signal ended it early."""
         table, logger, finished = None, RunLogger(), True
+        ahead = self._compile_ahead()
         try:
             for name in (*self.config.phases_before, *self.config.phases_to_do):
                 _seed_everything(self.config.seed)
                 with self.interrupt.work():
+                    if ahead is not None and name == "policy":
+                        ahead.wait()
                     phase = self._make_phase(name)
                 self.phases[name] = phase
                 if self.directory.phase(name).exists():
@@ -114,6 +118,8 @@ class RunLoop:
             finished = False
             self.keeper.save_frozen()
         finally:
+            if ahead is not None:
+                ahead.end()
             self._note_warnings()
             logger.close()
         if table is None and finished:  # everything was done before
@@ -151,6 +157,19 @@ class RunLoop:
             if found.taken and name in self.config.phases_to_do:
                 self.progress.say(found.words(name))
         return bool(chosen[name])
+
+    def _compile_ahead(self) -> CompileAhead | None:
+        """Let another process compile the policy phase, if the model is to be learned before."""
+        config = self.config
+        if self.directory.phase("model").exists() or not compiles_ahead(config, self.world):
+            return None
+        settings = resolve_seconds(config.section("policy"), self.world.task.time_step)
+        if not self._compiles("policy", settings, self.world):
+            return None
+        ahead = CompileAhead(config, self.world)
+        if ahead.is_at_work:
+            self.progress.say("Another process compiles the policy phase meanwhile.")
+        return ahead
 
     def _compile_step(self, name: str, world: World) -> None:
         """Compile the step of the model alone where phases that are not compiled earn it."""

@@ -258,7 +258,8 @@ def test_warm_up_says_what_another_process_cannot_be_given(caplog):
 
 
 def test_an_agent_stays_eager_where_the_other_process_fails(monkeypatch, caplog):
-    monkeypatch.setattr("phihp_torchrl.deployment.warm_up._CHILD", "raise SystemExit('no room')")
+    child = "phihp_torchrl.compilation.other_process._CHILD"
+    monkeypatch.setattr(child, "raise SystemExit('no room')")
     agent = make()
     expected = act(agent)
     assert not agent.warm_up(background=True).wait(60)

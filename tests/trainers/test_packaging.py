@@ -23,12 +23,11 @@ def asked(
     plans: bool = True,
     seconds: float = 200.0,
     compiled: bool = False,
-    cores: float = 2,
-    threads: int = 1,
+    idle_core: bool = True,
     copies: bool = True,
     plugins: tuple[str, ...] = (),
 ) -> bool:
-    monkeypatch.setattr(packaging, "_idle_cores", lambda threads: cores - threads)
+    monkeypatch.setattr(packaging, "has_idle_core", lambda threads: idle_core)
     task = get_task("pendulum")
     planner = CEMConfig() if plans else None
     agent = Agent(
@@ -41,7 +40,7 @@ def asked(
         compile=compiled,
         task=task,
         world=SimpleNamespace(copies=copies),
-        config=replace(CONFIG, threads=threads, plugins=plugins),
+        config=replace(CONFIG, plugins=plugins),
     )
     return packaging.packages_plan(context, agent)
 
@@ -56,9 +55,7 @@ def test_a_long_run_with_a_core_to_spare_leaves_one(monkeypatch):
         {"plans": False},
         {"seconds": 40.0},
         {"compiled": True},
-        {"cores": 1},
-        {"cores": 1.4},  # another run beside this one
-        {"threads": 2},
+        {"idle_core": False},
         {"copies": False},
         {"plugins": ("my_task.py",)},
     ],
@@ -67,14 +64,7 @@ def test_others_do_not(monkeypatch, changes):
     assert not asked(monkeypatch, **changes)
 
 
-@pytest.mark.parametrize(("load", "idle"), [(0.2, 1.0), (1.1, 0.9), (2.5, -0.5)])
-def test_cores_that_others_use_are_not_to_spare(monkeypatch, load, idle):
-    monkeypatch.setattr(packaging.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
-    monkeypatch.setattr(packaging.os, "getloadavg", lambda: (load, 9.0, 9.0), raising=False)
-    assert packaging._idle_cores(1) == pytest.approx(idle)
-
-
 def test_what_is_asked_for_is_done_where_there_is_a_plan(monkeypatch):
-    assert asked(monkeypatch, packaged=True, seconds=1.0, cores=1)
+    assert asked(monkeypatch, packaged=True, seconds=1.0, idle_core=False)
     assert not asked(monkeypatch, packaged=False)
     assert not asked(monkeypatch, packaged=True, plans=False)
