@@ -8,7 +8,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,12 +62,13 @@ class _PackagedPlan:
 
     Args:
         planner: the planner.
-        loaded: what the package is as a function of flat tensors.
+        loaded: the loaded package, a function of flat tensors.
         like: what a plan returns.
     """
 
-    def __init__(self, planner: SamplingPlanner, loaded: Callable[..., Any], like: Any) -> None:
-        self._planner, self._loaded = planner, loaded
+    def __init__(self, planner: SamplingPlanner, loaded: Any, like: Any) -> None:
+        # To call the package reads its layout anew each time, which is a twentieth of a fast plan.
+        self._planner, self._run = planner, loaded.loader.boxed_run
         _, self._spec = pytree.tree_flatten(like)
         self._weights = [*planner.parameters(), *planner.buffers()]
         self._versions = [tensor._version for tensor in self._weights]
@@ -80,7 +81,7 @@ class _PackagedPlan:
     def __call__(self, *args: Any) -> Any:
         if not self.is_current:
             return self._planner.plan_eagerly(*args)
-        return pytree.tree_unflatten(list(self._loaded(*_tensors(args))), self._spec)
+        return pytree.tree_unflatten(self._run(_tensors(args)), self._spec)
 
 
 def write_package(agent: Agent, path: Path) -> None:
@@ -95,7 +96,7 @@ def write_package(agent: Agent, path: Path) -> None:
     if reason := planner.why_not_compiled():
         raise AgentError(f"packaged: expected a plan that compiles, but {reason}.")
     arguments, _ = planner.example_call(agent.example())
-    compile_ahead(_Plan(planner, arguments), _tensors(arguments), path)
+    compile_ahead(_Plan(planner, arguments), tuple(_tensors(arguments)), path)
 
 
 def use_package(agent: Agent, path: Path) -> None:
@@ -270,5 +271,7 @@ def _description(path: Path) -> Path:
     return path.with_name(f"{path.name}.json")
 
 
-def _tensors(arguments: Any) -> tuple[Tensor, ...]:
-    return tuple(leaf for leaf in pytree.tree_leaves(arguments) if isinstance(leaf, Tensor))
+def _tensors(arguments: Any) -> list[Tensor]:
+    nested = any(isinstance(part, tuple) for part in arguments)
+    leaves = pytree.tree_leaves(arguments) if nested else arguments
+    return [leaf for leaf in leaves if isinstance(leaf, Tensor)]

@@ -140,7 +140,9 @@ class CEMPlanner(SamplingPlanner):
             actions = self.plan(tensordict, noise).actions
             return actions[..., 0, :].reshape((*batch, *self.action_spec.shape))
         starts, center = self._starts(tensordict), self.bounds.center
-        last = self.receding.last_action(starts, center.expand(*batch, -1))
+        last = None
+        if self._asks_for_last:
+            last = self.receding.last_action(starts, center.expand(*batch, -1))
         action = self.receding.act(
             lambda mean: self.plan(tensordict, noise, mean, last).actions,
             batch,
@@ -179,6 +181,9 @@ class CEMPlanner(SamplingPlanner):
         elif noise.shape != shape:
             raise ValueError(f"noise: expected shape {list(shape)}, got {list(noise.shape)}.")
         noise = colored(noise, self.settings.noise_beta, dim=1)
-        settings = self.settings
-        last = last if settings.change_cost or settings.keep_incumbent else None
-        return self._call_plan(tensordict, noise, mean, last)
+        return self._call_plan(tensordict, noise, mean, last if self._asks_for_last else None)
+
+    @property
+    def _asks_for_last(self) -> bool:
+        """Whether plans depend on the action before."""
+        return self.settings.change_cost > 0 or self.settings.keep_incumbent

@@ -118,13 +118,22 @@ def log_backend(planner: SamplingPlanner, no_tensors: str | None, compile: bool)
         )
 
 
+def finite_keys(planner: SamplingPlanner, expected: Specs) -> frozenset[NestedKey]:
+    """The expected keys that matter to plans, which must be finite."""
+    stepped_from = {unravel_key(k) for k in planner.env.full_state_spec_unbatched.keys(True, True)}
+    matters = {planner.observation_key, *module_keys(planner), *stepped_from}
+    return frozenset(key for key in expected if key in matters or not stepped_from)
+
+
 def check_observation(
-    planner: SamplingPlanner, tensordict: TensorDictBase, expected: Specs, device: torch.device
+    planner: SamplingPlanner,
+    tensordict: TensorDictBase,
+    expected: Specs,
+    finite: Collection[NestedKey],
+    device: torch.device,
 ) -> None:
     """Raise if an observation is missing, of the wrong shape, dtype or device, or not finite."""
     batch = tensordict.batch_size
-    stepped_from = {unravel_key(k) for k in planner.env.full_state_spec_unbatched.keys(True, True)}
-    matters = {planner.observation_key, *module_keys(planner), *stepped_from}
     for key, spec in expected.items():
         value = tensordict.get(key, None)
         shape = torch.Size([*batch, *spec.shape])
@@ -137,8 +146,8 @@ def check_observation(
                 f"got {value.dtype} of shape {list(value.shape)} on {value.device}.",
             )
         # On other devices this would synchronize; the plan then uses the actor's action.
-        checked = planner.check_finite and (key in matters or not stepped_from)
-        if checked and device.type == "cpu" and not is_finite(value):
+        checked = planner.check_finite and key in finite and device.type == "cpu"
+        if checked and not is_finite(value):
             raise ConfigError(str(key), "expected finite observations, got some that are not.")
 
 

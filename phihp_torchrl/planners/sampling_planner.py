@@ -34,6 +34,7 @@ from phihp_torchrl.planners.planner_checks import (
     check_modules,
     check_observation,
     choose_observation,
+    finite_keys,
     log_backend,
     module_keys,
     needed_keys,
@@ -206,6 +207,7 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
         self._compiles = bool(self._compile) and self.uses_tensors and self._tensors_compile()
         needed = needed_keys(self, situation, self._given_keys)
         self._expected = {key: situation[key] for key in needed}
+        self._finite = finite_keys(self, self._expected)
         self.in_keys = [*needed, *([] if self.receding is None else [self.is_init_key])]
 
     def _why_not_tensors(self) -> str | None:
@@ -397,4 +399,5 @@ class SamplingPlanner(StockAttributes, MPCPlannerBase):
 
     def check(self, tensordict: TensorDictBase) -> None:
         """Raise a ValueError for an observation that is missing, not finite, or of another form."""
-        check_observation(self, tensordict, self._expected, self._action_low.device)
+        device = self._action_low.device
+        check_observation(self, tensordict, self._expected, self._finite, device)

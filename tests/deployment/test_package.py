@@ -7,6 +7,7 @@ import logging
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -59,8 +60,13 @@ def saved(tmp_path_factory):
 
 @pytest.fixture
 def directory(saved, tmp_path, monkeypatch):
-    monkeypatch.setattr(torch._inductor, "aoti_load_package", lambda path: saved[1])
+    monkeypatch.setattr(torch._inductor, "aoti_load_package", lambda path: loaded(saved[1]))
     return Path(shutil.copytree(saved[0], tmp_path / "agent"))
+
+
+def loaded(program):
+    """A package that calls this program, as AOTInductor's loader has it."""
+    return SimpleNamespace(loader=SimpleNamespace(boxed_run=lambda given: list(program(*given))))
 
 
 def seen(agent, seed=0):
@@ -207,7 +213,7 @@ def test_a_package_that_finds_another_plan_is_refused(directory, saved, caplog, 
     def off(*args):
         return [10.0 + each for each in saved[1](*args)]
 
-    monkeypatch.setattr(torch._inductor, "aoti_load_package", lambda path: off)
+    monkeypatch.setattr(torch._inductor, "aoti_load_package", lambda path: loaded(off))
     load_agent(directory, packaged=True)
     assert "expected the plan of this agent" in ours(caplog)[0]
 
