@@ -161,6 +161,16 @@ register_method(
     ),
 )
 register_method(
+    "dd-phihp",
+    Method(
+        "dd-PhIHP",
+        "PhIHP with a model without prior",
+        _HYBRID,
+        model_kind="data_driven",
+        samples_key="model.real_steps",
+    ),
+)
+register_method(
     "td3-im-ph",
     Method(
         "TD3-im-ph",
@@ -183,6 +193,7 @@ register_method(
         model_kind="data_driven",
         group="imagined",
         samples_key="model.real_steps",
+        also_in=("dd-phihp", "actor"),
     ),
 )
 register_method(

@@ -18,6 +18,7 @@ _PAPER_ORDER = (
     "ph-td-mpc-star",
     "dd-cem",
     "ph-cem",
+    "dd-phihp",
     "td3-im-ph",
     "td3-im-dd",
 )
@@ -75,6 +76,7 @@ def systems(*groups: str) -> tuple[PaperSystem, ...]:
 
 
 PHIHP, TD_MPC, TD3 = system("phihp"), system("td-mpc"), system("td3")
+DD_PHIHP = system("dd-phihp")
 TD3_IM_PH, TD3_IM_DD = system("td3-im-ph"), system("td3-im-dd")
 PH_CEM, DD_CEM = system("ph-cem"), system("dd-cem")
 PH_TD_MPC_STAR, TD_MPC_STAR = system("ph-td-mpc-star"), system("td-mpc-star")

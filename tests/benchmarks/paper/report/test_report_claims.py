@@ -6,7 +6,8 @@ from pathlib import Path
 
 from kept_runs import make, make_run, results, table, text
 
-from report.claims import claims_section, fewer_samples, planning_improves
+from report import read_runs
+from report.claims import claims_section, fewer_samples, hybrid_earns_more, planning_improves
 from report.paper_systems import (
     DD_CEM,
     PH_CEM,
@@ -48,7 +49,7 @@ def test_each_claim_gets_its_verdict(tmp_path: Path) -> None:
     ]
     ratio = "5.0 to 5.0 times"
     assert rows["5, pendulum"][:4] == ["shown", "4.0 ms against 20.0", ratio, ratio]
-    assert rows["4, Ph-CEM on pendulum"][2:] == ["–", "−0.1 to 0.3", "3, 3"]
+    assert rows["4, Ph-CEM on pendulum, 500 samples"][2:] == ["–", "−0.1 to 0.3", "3, 3"]
     assert [finding.what for finding in fewer_samples(found)] == ["pendulum"]
 
 
@@ -167,7 +168,33 @@ def test_equal_samples_are_those_with_enough_seeds(tmp_path: Path) -> None:
     for method in ("ph-cem", "dd-cem"):
         make_run(tmp_path, method, samples=5000, acting={"planner": [1.0]})
     rows = claims_section(results(tmp_path)).tables["Comparisons"].rows
-    assert [(row[0], row[-1]) for row in rows] == [("4, Ph-CEM on pendulum", "3, 3")]
+    assert [(row[0], row[-1]) for row in rows] == [("4, Ph-CEM on pendulum, 500 samples", "3, 3")]
+
+
+def test_the_hybrid_is_compared_at_few_samples_and_at_many(tmp_path: Path) -> None:
+    """Its twin without a prior was made by a grid of PhIHP with that setting, as label says."""
+    for seed in (0, 1, 2):
+        for samples, gain in ((100, 9.0), (1000, 0.1)):
+            ours = {"planner": [5.0 + gain + 0.1 * seed], "actor": [4.0 + gain + 0.1 * seed]}
+            make_run(tmp_path, seed=seed, samples=samples, acting=ours)
+            more = (0.0, 0.5, -0.5)[seed]
+            theirs = {"planner": [5.0 + more], "actor": [4.0 + more]}
+            make_run(tmp_path, seed=seed, samples=samples, acting=theirs, label="data-driven",
+                     kind="data_driven")  # fmt: skip
+    found = {finding.what: finding for finding in hybrid_earns_more(results(tmp_path))}
+    assert {name: (f.verdict, f.effect.split(",")[0]) for name, f in found.items()} == {
+        "PhIHP on pendulum, 100 samples": ("shown", "+9.1"),
+        "PhIHP on pendulum, 1000 samples": ("not shown", "+0.2"),
+        "TD3-im-ph on pendulum, 100 samples": ("shown", "+9.1"),
+        "TD3-im-ph on pendulum, 1000 samples": ("not shown", "+0.2"),
+    }
+
+
+def test_a_twin_that_has_a_prior_is_left_out(tmp_path: Path) -> None:
+    make_run(tmp_path, label="data-driven", kind="hybrid")
+    folders = read_runs(tmp_path)
+    assert not folders.runs
+    assert "model.kind: expected 'data_driven' for dd-phihp, got 'hybrid'" in folders.problems[0]
 
 
 def test_cells_of_other_episodes_are_not_compared(tmp_path: Path) -> None:

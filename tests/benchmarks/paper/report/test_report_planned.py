@@ -112,13 +112,19 @@ def test_systems_planned_at_different_samples_are_no_comparison(tmp_path: Path) 
           for seed in range(3)]  # fmt: skip
     make_planned(tmp_path, *im)
     plan(tmp_path, *im)
-    alone = rows(tmp_path)["4, TD3-im-ph on pendulum"]
+    alone = rows(tmp_path)["4, TD3-im-ph on pendulum, 1000 samples"]
     make_planned(tmp_path, *ours, *theirs)
     plan(tmp_path, *ours, *theirs)
-    assert rows(tmp_path) == {"4, TD3-im-ph on pendulum": alone}  # of a family of one
+    assert rows(tmp_path) == {"4, TD3-im-ph on pendulum, 1000 samples": alone}  # of a family of one
     # A cell of one side at the samples of the other makes it one.
     plan(tmp_path, Cell("dd-cem", "pendulum", 100, 500))
-    assert rows(tmp_path)["4, Ph-CEM on pendulum"] == ["not run", "–", "–", "–", "3, 0 of 1"]
+    assert rows(tmp_path)["4, Ph-CEM on pendulum, 500 samples"] == [
+        "not run",
+        "–",
+        "–",
+        "–",
+        "3, 0 of 1",
+    ]
 
 
 def test_a_comparison_at_equal_samples_is_missing_where_it_was_planned(tmp_path: Path) -> None:
@@ -131,7 +137,7 @@ def test_a_comparison_at_equal_samples_is_missing_where_it_was_planned(tmp_path:
     }  # fmt: skip
     make_planned(tmp_path, *cells["ph-cem", 500], *cells["dd-cem", 1000])
     plan(tmp_path, *(cell for group in cells.values() for cell in group))
-    assert rows(tmp_path)["4, Ph-CEM on pendulum"][-1] == "0 of 4, 5"
+    assert rows(tmp_path)["4, Ph-CEM on pendulum, 1000 samples"][-1] == "0 of 4, 5"
 
 
 def test_runs_without_the_number_that_is_compared_are_not_missing(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def cell(made: Table, row: str, key: str) -> str:
 def test_rows_are_those_of_the_registry_in_the_papers_order() -> None:
     assert [one.name for one in systems()] == [
         "PhIHP", "TD-MPC", "TD3", "CEM-oracle", "TD-MPC*", "Ph-TD-MPC*", "dd-CEM", "Ph-CEM",
-        "TD3-im-ph", "TD3-im-dd",
+        "dd-PhIHP", "TD3-im-ph", "TD3-im-dd",
     ]  # fmt: skip
     assert {one.sources[0][0] for one in systems()} == set(METHODS)
     assert [one.name for one in systems("imagined")] == ["TD3-im-ph", "TD3-im-dd"]
