@@ -17,6 +17,7 @@ from phihp_torchrl.baselines.registry import (
     register_baseline,
 )
 from phihp_torchrl.baselines.settle import Settle
+from phihp_torchrl.baselines.take_over import TakeOver
 
 CATCHES = {sort.kind: sort for sort in (Catch, Settle)}
 """The regulators that may take over from an agent's plans, by their kind in files."""

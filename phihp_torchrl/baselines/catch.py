@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from phihp_torchrl.baselines.energy import find_energy
 from phihp_torchrl.baselines.lqr import LQR
 from phihp_torchrl.baselines.point import LinearModel, half_ranges, physical_step
+from phihp_torchrl.baselines.take_over import TakeOver
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.tasks import Task
 
@@ -32,7 +33,7 @@ _NONE = np.zeros((0, 0))
 """In the place of matrices that a difference to a point does not need."""
 
 
-class Catch(nn.Module):
+class Catch(TakeOver):
     r"""A regulator at the goal that takes over from another controller where it is near enough.
 
     It acts where the cost-to-go :math:`z^\top P z` of the regulator is below a level, by
@@ -60,7 +61,7 @@ class Catch(nn.Module):
     """
 
     kind: ClassVar[str] = "goal"
-    """The name of this sort of regulator in files."""
+    distance: ClassVar[str] = "level"
 
     at: Tensor
     keeping: Tensor
@@ -68,10 +69,8 @@ class Catch(nn.Module):
     cost: Tensor
     level: Tensor
 
-    def __init__(self, task: Task, moved: tuple[int, ...] = ()) -> None:
-        super().__init__()
-        self.task, self.moved = task, tuple(moved)
-        size, actions = task.system.state_dim + len(self.moved), task.action_dim
+    def __init__(self, task: Task, moved: Sequence[int] = ()) -> None:
+        size, actions = task.system.state_dim + len(moved), task.action_dim
         shapes = {
             "at": [size],
             "keeping": [actions],
@@ -79,8 +78,7 @@ class Catch(nn.Module):
             "cost": [size, size],
             "level": [],
         }
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.zeros(shape))
+        super().__init__(task, moved, shapes)
 
     @classmethod
     def from_model(cls, task: Task, dynamics: nn.Module, share: float = 1.0) -> Catch:
@@ -111,12 +109,6 @@ class Catch(nn.Module):
         error = self._error(state)
         return self._is_near(error), self._action(error)
 
-    def follow(self, sent: Tensor) -> None:
-        """Do nothing: it acts by the state alone."""
-
-    def reset(self) -> None:
-        """Do nothing, as :meth:`follow`."""
-
     def near(self, state: Tensor) -> Tensor:
         """Whether it acts in a state of the task ``[*batch, n]``, bool ``[*batch]``."""
         return self._is_near(self._error(state))
@@ -130,12 +122,6 @@ class Catch(nn.Module):
         near, own = self.take(state)
         return torch.where(near.unsqueeze(-1), own, action)
 
-    def closer(self, share: float) -> Catch:
-        """The same regulator, which takes over at a share of the level."""
-        made = Catch(self.task, self.moved)
-        made.load_state_dict(self.state_dict() | {"level": share * self.level})
-        return made.to(self.level.device)
-
     def _error(self, state: Tensor) -> Tensor:
         point = LinearModel(self.task, self.at, self.keeping, _NONE, _NONE, self.moved)
         return point.difference(state)
@@ -145,32 +131,6 @@ class Catch(nn.Module):
 
     def _action(self, error: Tensor) -> Tensor:
         return self.task.clip_action(self.keeping.to(error) - error @ self.gain.to(error).mT)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Plain values from which it can be built again, without the buffers."""
-        return {"kind": self.kind, "moved": list(self.moved)}
-
-    @classmethod
-    def from_config(cls, task: Task, config: Mapping[str, Any]) -> Catch:
-        """Build what :attr:`config` describes, with buffers of zeros.
-
-        Raises:
-            ConfigError: for registers that the task does not have; the message names the key.
-        """
-        return cls(task, check_moved(task, config["moved"]))
-
-
-def check_moved(task: Task, moved: Any) -> tuple[int, ...]:
-    """The places of registers that a file names.
-
-    Raises:
-        ConfigError: for others than the task has.
-    """
-    places = range(task.register_count)
-    if not isinstance(moved, (list, tuple)) or not set(moved) <= set(places):
-        raise ConfigError("moved", f"expected places below {len(places)}, got {moved!r}.")
-    return tuple(moved)
 
 
 def find_catch(task: Task, dynamics: nn.Module) -> tuple[LQR, float]:

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from phihp_torchrl.baselines.catch import check_moved
 from phihp_torchrl.baselines.equilibria import Equilibria
 from phihp_torchrl.baselines.lqi import LQI
 from phihp_torchrl.baselines.point import LinearModel
 from phihp_torchrl.baselines.reference import followed, present
 from phihp_torchrl.baselines.riccati import Regulator
+from phihp_torchrl.baselines.take_over import TakeOver, check_moved
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.tasks import Task
 
@@ -28,7 +28,7 @@ _LEAVE = 3.0
 """How many times as far it goes on, so that who acts does not change with every step."""
 
 
-class Settle(nn.Module):
+class Settle(TakeOver):
     """A regulator with integral action that takes over where a reference stands still.
 
     It acts where what is known of the reference is constant, since the step before and in the
@@ -62,7 +62,7 @@ class Settle(nn.Module):
     """
 
     kind: ClassVar[str] = "settle"
-    """The name of this sort of regulator in files."""
+    distance: ClassVar[str] = "reach"
 
     at: Tensor
     keeping: Tensor
@@ -73,11 +73,9 @@ class Settle(nn.Module):
     wait: Tensor
 
     def __init__(self, task: Task, moved: Sequence[int] = (), rows: Sequence[int] = ()) -> None:
-        super().__init__()
-        self.task, self.moved, self.rows = task, tuple(moved), tuple(rows)
-        self.places = list(followed(task).values())
+        places = list(followed(task).values())
         actions, physical = task.action_dim, task.system.state_dim
-        size, count = physical + len(self.moved), len(self.places)
+        size, count = physical + len(moved), len(places)
         shapes = {
             "at": [size],
             "keeping": [actions],
@@ -86,11 +84,11 @@ class Settle(nn.Module):
             "reach": [count],
             "tenth": [count],
             "wait": [],
-            **{f"values_{i}": [n] for i, n in enumerate(self.rows)},
-            **{f"shifts_{i}": [n, physical + actions] for i, n in enumerate(self.rows)},
+            **{f"values_{i}": [n] for i, n in enumerate(rows)},
+            **{f"shifts_{i}": [n, physical + actions] for i, n in enumerate(rows)},
         }
-        for name, shape in shapes.items():
-            self.register_buffer(name, torch.zeros(shape))
+        super().__init__(task, moved, shapes)
+        self.rows, self.places = tuple(rows), places
         self._before: Tensor | None = None
         self._stood: Tensor | None = None
         self._near: Tensor | None = None
@@ -130,12 +128,7 @@ class Settle(nn.Module):
         return made
 
     def take(self, state: Tensor, starts: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Where it acts, bool ``[*batch]``, and its action ``[*batch, m]``; a step of its memory.
-
-        Args:
-            state: states of the task, ``[*batch, n]``.
-            starts: whether an episode starts, bool ``[*batch]``; ``None`` if unknown.
-        """
+        """Where it acts, and its action, as the base says; a step of its memory."""
         task, batch = self.task, state.shape[:-1]
         physical, registers = task.split(state)
         known = task.outside.split(registers)["reference"]
@@ -172,12 +165,6 @@ class Settle(nn.Module):
         self._before = self._stood = self._near = self._sent = None
         self._built = []
 
-    def closer(self, share: float) -> Settle:
-        """The same regulator, which takes over within a share of the distance."""
-        made = Settle(self.task, self.moved, self.rows)
-        made.load_state_dict(self.state_dict() | {"reach": share * self.reach})
-        return made.to(self.reach.device)
-
     @property
     def _regulator(self) -> LQI:
         """The regulator of these buffers, which keeps the integrals."""
@@ -196,8 +183,8 @@ class Settle(nn.Module):
 
     @property
     def config(self) -> dict[str, Any]:
-        """Plain values from which it can be built again, without the buffers."""
-        return {"kind": self.kind, "moved": list(self.moved), "rows": list(self.rows)}
+        """Those of the base, and the sizes of its tables."""
+        return {**super().config, "rows": list(self.rows)}
 
     @classmethod
     def from_config(cls, task: Task, config: Mapping[str, Any]) -> Settle:

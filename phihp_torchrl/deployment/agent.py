@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 
 from phihp_torchrl.agents import Actor, TwinQ
-from phihp_torchrl.baselines import CATCHES, Catch, Controller, Settle
+from phihp_torchrl.baselines import CATCHES, Controller, Settle, TakeOver
 from phihp_torchrl.config import ConfigError, kind_mapping, read_kind, resolve_seconds
 from phihp_torchrl.deployment.under_way import UnderWay
 from phihp_torchrl.deployment.warm_up import WarmUp
@@ -89,7 +89,7 @@ class Agent(TensorDictModuleBase):
         dynamics: HybridDynamics | None = None,
         actor: Actor | TensorDictModuleBase | None = None,
         qvalue: TwinQ | TensorDictModuleBase | None = None,
-        catch: Catch | Settle | None = None,
+        catch: TakeOver | None = None,
         planner_config: SearchConfig | None = None,
         use_planner: bool = True,
         compile: bool | dict[str, Any] = False,

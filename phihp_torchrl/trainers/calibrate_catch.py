@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
-from phihp_torchrl.baselines import Catch, Settle
+from phihp_torchrl.baselines import Catch, Settle, TakeOver
 from phihp_torchrl.config import ConfigError
 from phihp_torchrl.planners import RESTS
 from phihp_torchrl.trainers.calibrate_contest import Contest
@@ -109,7 +109,7 @@ class CatchTrial:
             "chatter_before": before.mean_chatter,
         }
 
-    def made(self, record: Mapping[str, Any] | None) -> Catch | Settle | None:
+    def made(self, record: Mapping[str, Any] | None) -> TakeOver | None:
         """The regulator of a record."""
         return None if record is None else self._catch(record["way"])
 
@@ -138,11 +138,11 @@ class CatchTrial:
         return True
 
     @cached_property
-    def _widest(self) -> Catch | Settle | None:
+    def _widest(self) -> TakeOver | None:
         """The regulator that takes over from furthest, at the goal or on a reference, if any."""
         agent = self.contest.agent
         assert agent.dynamics is not None
-        sort: type[Catch | Settle] = Catch if agent.task.reference is None else Settle
+        sort: type[TakeOver] = Catch if agent.task.reference is None else Settle
         try:
             made = sort.from_model(agent.task, agent.dynamics)
         except ConfigError:  # there is no goal to stay in
@@ -157,5 +157,5 @@ class CatchTrial:
             return None
         return made.to(self.contest.starts.device)
 
-    def _catch(self, name: str) -> Catch | Settle | None:
+    def _catch(self, name: str) -> TakeOver | None:
         return None if self._widest is None else self._widest.closer(_SHARES[name])

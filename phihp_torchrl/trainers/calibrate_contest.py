@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from phihp_torchrl.baselines import Catch, Settle
+from phihp_torchrl.baselines import TakeOver
 from phihp_torchrl.deployment import Agent
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.trainers.calibrate_budget import Price, first_episodes, of_ways
@@ -54,7 +54,7 @@ class Contest:
         self.world_model = TaskWorldModel(agent.task, agent.dynamics)
         self.starts, self.seed, self.price = starts, seed, Price.of(agent)
         self.ways: dict[str, dict[str, Any]] = {}
-        self.catches: dict[str, Catch | Settle] = {}
+        self.catches: dict[str, TakeOver] = {}
         """The regulators that act near the goal, of the ways that have one."""
         self.playing: list[str] = []
         self.episodes, self.spent = 0, 0.0
@@ -115,9 +115,7 @@ class Contest:
         self.episodes += max(more, 0)
         return more > 0
 
-    def add(
-        self, name: str, changes: Mapping[str, Any], catch: Catch | Settle | None = None
-    ) -> None:
+    def add(self, name: str, changes: Mapping[str, Any], catch: TakeOver | None = None) -> None:
         """Let one more way to plan play as many episodes as the last ones have.
 
         Args:
