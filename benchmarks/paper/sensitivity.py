@@ -24,6 +24,7 @@ from omegaconf.errors import MissingMandatoryValue
 from phihp_torchrl.config import ConfigError, check_count, from_mapping
 from phihp_torchrl.deployment import Agent, AgentError, load_agent
 from phihp_torchrl.evaluation import evaluate, measure_latency
+from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.planners import CEMConfig, SearchConfig
 from phihp_torchrl.trainers import import_plugins
 from phihp_torchrl.worlds import World, make_world
@@ -40,12 +41,14 @@ class Config:
     num_policy_candidates: tuple[int, ...] = ()
     num_random_candidates: tuple[int, ...] = ()
     episodes: int = 20
+    first_seed: int = 500_000
     latency_actions: int = 100
     out: str = "results/sensitivity"
     plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_count(self, "episodes", "latency_actions")
+        check_count(self, "first_seed", least=0)
         least = {"planning_horizon": 1, "replan_every": 1, "num_policy_candidates": 0,
                  "num_random_candidates": 0}  # fmt: skip
         for name, low in least.items():
@@ -143,11 +146,22 @@ def play(
 ) -> Trial:
     """Return and time of the agent with that planner, from the same starts each time."""
     changed = agent.with_planner(planner)
-    played = evaluate(changed, agent.task, episodes=config.episodes, world=world)
+    played = evaluate(
+        changed, agent.task, episodes=config.episodes, seed=config.first_seed, world=world
+    )
     latency = measure_latency(changed, agent.task, calls=config.latency_actions)
     # With replanning every few steps most actions cost nothing: the mean is what a step costs.
     return Trial(
-        agent.task.name, seed, name, value, played.mean, played.std, config.episodes, latency.mean
+        agent.task.name,
+        seed,
+        name,
+        value,
+        played.mean,
+        played.std,
+        config.episodes,
+        latency.mean,
+        config.first_seed,
+        origin_text(describe_origin(seed)),
     )
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from phihp_torchrl.evaluation import EVALUATION_SEED
 from report.sections import Picture, Section
 from report.tables import Number, Table, TableCell
 
@@ -35,6 +36,8 @@ class Trial:
         return_std: its standard deviation over episodes.
         episodes: how many.
         milliseconds: mean time of an action, whether it needed a new plan or not.
+        first_seed: seed of the episodes; older trials were of evaluation episodes.
+        origin: commit and machine.
     """
 
     task: str
@@ -45,6 +48,8 @@ class Trial:
     return_std: float
     episodes: int
     milliseconds: float
+    first_seed: int = EVALUATION_SEED
+    origin: str = "commit unknown"
 
 
 def write_trials(path: Path, trials: Sequence[Trial]) -> None:
@@ -101,6 +106,13 @@ def sensitivity(trials: Sequence[Trial]) -> Section:
         "`python benchmarks/paper/sensitivity.py`: horizon H, steps between two plans RH, "
         "candidates of the actor N_π, random candidates N_rand."
     )
+    looked_at = sorted({t.task for t in trials if t.first_seed >= EVALUATION_SEED})
+    if looked_at:
+        text += (
+            f" In episodes of evaluation, so that no default may follow: {', '.join(looked_at)}."
+        )
+    if trials:
+        text += f" {'; '.join(sorted({t.origin for t in trials}))}."
     return Section(
         "Sensitivity",
         text if trials else f"{text} Not run.",
