@@ -9,7 +9,7 @@ spent. No real step is taken and no real episode played: networks are chosen in 
 Writes results/networks/{task}-{variant}-seed{seed}.json after every evaluation, and README.md.
 
 What stands between two layers is no setting of the package, whose networks have ReLU. A variant
-that has something else replaces it in this process alone.
+that has something else replaces it in this process alone, where TD3 learns.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from statistics import mean
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import torch
@@ -85,7 +85,7 @@ VARIANTS: dict[str, Variant] = {
 
 @contextmanager
 def between_layers(name: str) -> Iterator[None]:
-    """Put this between the layers of all networks of the process, in the place of ReLU."""
+    """Put this between the layers of TD3's actors and critics, in the place of ReLU."""
     if name == "relu":
         yield
         return
@@ -137,6 +137,7 @@ def train(
             "variant": variant,
             "settings": settings,
             "between": VARIANTS[variant].between,
+            "compiled": compile,
             "seed": seed,
             "done": trainer.done,
             "curve": curve,
@@ -154,7 +155,7 @@ def write_tables(results: Path) -> None:
     text = (
         "# Networks\n\nMade by `python benchmarks/paper/networks.py`. Do not edit. Returns are "
         "imagined, of the best actor. Seconds are of CPU time, one thread, from the first "
-        "evaluation on. Nothing is compiled, as in runs by default.\n"
+        "evaluation on. Runs by default compile nothing; rows that did say so.\n"
     )
     for task in TARGETS:
         mine = [run for run in runs if run["task"] == task and run["done"]]
@@ -164,8 +165,8 @@ def write_tables(results: Path) -> None:
         floor = min(run["curve"][0]["best"] for run in mine)
         top = max(run["curve"][-1]["best"] for run in mine)
         table = []
-        for variant in sorted({run["variant"] for run in mine}):
-            here = [run for run in mine if run["variant"] == variant]
+        for variant in sorted({_row(run) for run in mine}):
+            here = [run for run in mine if _row(run) == variant]
             level = floor + 0.98 * (top - floor)
             reached = [
                 next(
@@ -204,6 +205,11 @@ def write_tables(results: Path) -> None:
     text += "; ".join(f"{name}: {_words(v)}" for name, v in VARIANTS.items() if name in used)
     text += ".\n"
     (results / "README.md").write_text(text)
+
+
+def _row(run: dict[str, Any]) -> str:
+    """The row of a run in its task's table."""
+    return f"{run['variant']}, compiled" if run.get("compiled") else run["variant"]
 
 
 def _words(variant: Variant) -> str:

@@ -38,7 +38,7 @@ _RUN = """
 import sys
 from phihp_torchrl.trainers import compile_ahead
 idle = sys.argv.pop(1) == "ahead"
-compile_ahead.has_idle_core = lambda threads: idle
+compile_ahead.has_idle_core = lambda threads, begun: idle
 from phihp_torchrl.commands import main
 main()
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
@@ -13,7 +13,7 @@ from phihp_torchrl.config import ConfigError
 from phihp_torchrl.tasks import Task
 
 
-class TakeOver(nn.Module):
+class TakeOver(nn.Module, ABC):
     """A regulator that acts in states which are near, in the place of whoever acts elsewhere.
 
     Its numbers are buffers, so it is saved with an agent's weights.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -11,12 +12,15 @@ import threading
 import time
 import weakref
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
 _CHILD = "import sys; from phihp_torchrl.compilation.other_process import work; work(*sys.argv[1:])"
 # Seconds that a process has to end, since it may be writing.
 _GRACE = 5.0
+# How far it makes way for others, in the scheduler's levels.
+_NICE = 10
 
 
 class OtherProcess:
@@ -62,7 +66,7 @@ class OtherProcess:
     @property
     def failure(self) -> str:
         """The last line that a failed process has written, which says why; else nothing."""
-        if not self._process.poll():
+        if not self._process.poll() or not self._end.alive:  # it was ended
             return ""
         text = (self.place / "log").read_text(errors="replace", encoding="utf-8").strip()
         return (text.splitlines() or ["no reason given"])[-1]
@@ -87,6 +91,8 @@ def work(function: str, parent: str, place: str, *words: str) -> None:
     """Call the function: what the other process does."""
     watched = int(parent), Path(place)
     threading.Thread(target=_end_with, args=watched, daemon=True).start()
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
     module, name = function.split(":")
     getattr(import_module(module), name)(place, *words)
 
@@ -96,14 +102,29 @@ def _end_with(parent: int, place: Path) -> None:
     while os.getppid() == parent:
         time.sleep(1.0)
     shutil.rmtree(place, ignore_errors=True)
+    if hasattr(os, "killpg"):
+        os.killpg(0, signal.SIGKILL)  # with the compilers that it has started
     os._exit(1)
 
 
 def _end(process: subprocess.Popen[bytes], place: tempfile.TemporaryDirectory[str]) -> None:
     if process.poll() is None:
-        process.terminate()
+        _stop(process, "SIGTERM")
         try:
             process.wait(_GRACE)
         except subprocess.TimeoutExpired:
-            process.kill()
-    place.cleanup()
+            _stop(process, "SIGKILL")
+            process.wait()
+    with suppress(OSError):  # a compiler may still be writing
+        place.cleanup()
+
+
+def _stop(process: subprocess.Popen[bytes], name: str) -> None:
+    """Send a signal to the process, and to the compilers that it has started."""
+    if hasattr(os, "killpg"):
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, getattr(signal, name))
+    elif name == "SIGTERM":
+        process.terminate()
+    else:
+        process.kill()

@@ -8,16 +8,17 @@ import pickle
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from phihp_torchrl.compilation import OtherProcess
 from phihp_torchrl.config import resolve_seconds
-from phihp_torchrl.trainers.idle import has_idle_core
-from phihp_torchrl.trainers.model_config import ModelConfig, make_dynamics
+from phihp_torchrl.trainers.model_config import ModelConfig, first_integrator, make_dynamics
 from phihp_torchrl.trainers.policy import PolicyTrainer
 from phihp_torchrl.trainers.policy_config import PolicyConfig
 from phihp_torchrl.trainers.run_config import RunConfig
+from phihp_torchrl.trainers.spare import has_idle_core, is_importable
 from phihp_torchrl.worlds import World
 
 DOING = "waiting for what another process compiles"
@@ -36,8 +37,8 @@ class CompileAhead:
 
     Another process trains a policy of the run's sizes in an untrained model for as long as
     everything takes that is compiled. What it makes has no part in the run, which finds graphs of
-    the same code and shapes in the cache. Where the fit of the model changes those, as by another
-    integrator, the phase compiles as it would have.
+    the same code and shapes in the cache. Where the fit of the model changes those
+    (:meth:`still_fits`), or anything fails, the phase compiles as it would have.
 
     Args:
         config: settings of the run.
@@ -45,24 +46,35 @@ class CompileAhead:
     """
 
     def __init__(self, config: RunConfig, world: World) -> None:
+        self.config, self.world = config, world
         self._process: OtherProcess | None = None
         try:
             given = pickle.dumps((config, world))
             place = tempfile.TemporaryDirectory(prefix="phihp-compile-")
             Path(place.name, _GIVEN).write_bytes(given)
-        except (OSError, pickle.PicklingError, AttributeError, TypeError) as error:
+            self._process = OtherProcess(f"{__name__}:compile_policy", [], place)
+        except Exception as error:  # a world may refuse in any way, and a run needs none of it
             _log.debug("Nothing is compiled ahead, for another process cannot have it: %s", error)
-            return
-        self._process = OtherProcess(f"{__name__}:compile_policy", [], place)
 
     @property
     def is_at_work(self) -> bool:
         """Whether the other process is at work."""
         return self._process is not None and not self._process.ended
 
+    def still_fits(self, model: Any) -> bool:
+        """Whether the policy phase has the same graphs after this phase of the model.
+
+        It has not where the fit has chosen another integrator, or has found an actuator, with which
+        the world has another task.
+        """
+        settings, dynamics = self.config.section("model"), getattr(model, "dynamics", None)
+        same = str(getattr(dynamics, "integrator", "")) == str(first_integrator(settings))
+        world = getattr(model, "world", self.world)
+        return (same or settings.kind == "oracle") and world is self.world
+
     def wait(self) -> None:
         """Wait until all is in the cache that the other process can put there."""
-        if self._process is None:
+        if self._process is None or self._process.ended:
             return
         try:
             self._process.wait(_PATIENCE)
@@ -82,17 +94,21 @@ def compiles_ahead(config: RunConfig, world: World) -> bool:
     """Whether another process may compile the policy phase: it costs nobody much.
 
     The model is learned before, in a simulated world, a core is to spare, and the other process
-    finds what the run is made of, which no plugin has.
+    finds what the run is made of. A policy phase that ends after so many seconds compiles by
+    itself, for how far it gets must not depend on an idle core.
 
     Args:
         config: settings of the run, whose policy phase is compiled.
         world: its world.
     """
-    if not {"model", "policy"} <= set(config.phases_to_do) or config.plugins:
+    if not {"model", "policy"} <= set(config.phases_to_do):
         return False
-    if not isinstance(config.sections.get("model"), ModelConfig) or world.truth is None:
+    model, policy = (config.section(name) for name in ("model", "policy"))
+    if not isinstance(model, ModelConfig) or not isinstance(policy, PolicyConfig):
         return False
-    return has_idle_core(config.threads)
+    if policy.max_seconds is not None or world.truth is None:
+        return False
+    return is_importable(config, world.task) and has_idle_core(config.threads, begun=False)
 
 
 def compile_policy(place: str) -> None:

@@ -24,7 +24,7 @@ from phihp_torchrl.dynamics import (
     HybridDynamics,
     perturbed_constants,
 )
-from phihp_torchrl.integrators import check_integrator, has_substeps, integrator_of
+from phihp_torchrl.integrators import Integrator, check_integrator, has_substeps, integrator_of
 from phihp_torchrl.trainers.collect import (
     CollectConfig,
 )
@@ -186,8 +186,7 @@ def make_dynamics(
                 "model.kind", f"expected another than 'oracle': {world} has no truth to plan with."
             )
         return world.oracle()
-    # The cheapest is the first that is tried (fit_solver).
-    integrator = SOLVERS[0] if config.integrator == AUTO else integrator_of(config)
+    integrator = first_integrator(config)
     activation, sizes = _ACTIVATIONS[config.activation], config.hidden_sizes
     if config.kind == "data_driven":
         return HybridDynamics.data_driven(
@@ -209,6 +208,11 @@ def make_dynamics(
         integrator=integrator,
         ensemble=config.ensemble,
     )
+
+
+def first_integrator(config: ModelConfig) -> Integrator:
+    """The integrator of an untrained model; of ``auto`` the cheapest, which is tried first."""
+    return SOLVERS[0] if config.integrator == AUTO else integrator_of(config)
 
 
 def _first_guess(world: World, error: float, generator: torch.Generator | None) -> dict[str, float]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from phihp_torchrl.deployment import Agent, place_package
 from phihp_torchrl.trainers.context import Context
-from phihp_torchrl.trainers.idle import has_idle_core
+from phihp_torchrl.trainers.spare import has_idle_core, is_importable
 
 _log = logging.getLogger(__name__)
 
@@ -64,10 +64,5 @@ def packages_plan(context: Context, agent: Agent) -> bool:
     on_cpu = all(tensor.device.type == "cpu" for tensor in agent.parameters())
     if seconds < _EARNS or context.compile or not on_cpu or not context.world.copies:
         return False
-    return has_idle_core(context.config.threads) and _is_importable(context)
-
-
-def _is_importable(context: Context) -> bool:
-    """Whether another process finds what the task is made of, which no plugin or prompt has."""
-    parts = (context.task.reward, type(context.task.system))
-    return not context.config.plugins and all(part.__module__ != "__main__" for part in parts)
+    config = context.config
+    return has_idle_core(config.threads, begun=True) and is_importable(config, context.task)

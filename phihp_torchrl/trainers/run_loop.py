@@ -95,9 +95,9 @@ class RunLoop:
         try:
             for name in (*self.config.phases_before, *self.config.phases_to_do):
                 _seed_everything(self.config.seed)
+                if ahead is not None and name == "policy":
+                    self._wait_for(ahead)
                 with self.interrupt.work():
-                    if ahead is not None and name == "policy":
-                        ahead.wait()
                     phase = self._make_phase(name)
                 self.phases[name] = phase
                 if self.directory.phase(name).exists():
@@ -118,10 +118,10 @@ class RunLoop:
             finished = False
             self.keeper.save_frozen()
         finally:
-            if ahead is not None:
-                ahead.end()
             self._note_warnings()
             logger.close()
+            if ahead is not None:
+                ahead.end()
         if table is None and finished:  # everything was done before
             self.record.complete(self.phases, self.position.unit)
         return finished
@@ -170,6 +170,16 @@ class RunLoop:
         if ahead.is_at_work:
             self.progress.say("Another process compiles the policy phase meanwhile.")
         return ahead
+
+    def _wait_for(self, ahead: CompileAhead) -> None:
+        """Wait for what is compiled ahead, if it is still of use; that is time of the policy."""
+        start = time.monotonic()
+        if ahead.still_fits(self.phases["model"]):
+            with self.interrupt.work():
+                ahead.wait()
+        else:
+            ahead.end()
+        self.position.seconds["policy"] = time.monotonic() - start
 
     def _compile_step(self, name: str, world: World) -> None:
         """Compile the step of the model alone where phases that are not compiled earn it."""

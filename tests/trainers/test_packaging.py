@@ -27,7 +27,7 @@ def asked(
     copies: bool = True,
     plugins: tuple[str, ...] = (),
 ) -> bool:
-    monkeypatch.setattr(packaging, "has_idle_core", lambda threads: idle_core)
+    monkeypatch.setattr(packaging, "has_idle_core", lambda threads, begun: idle_core)
     task = get_task("pendulum")
     planner = CEMConfig() if plans else None
     agent = Agent(

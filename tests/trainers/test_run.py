@@ -133,7 +133,7 @@ def test_no_graph_breaks_and_none_is_compiled_twice(
 ) -> None:
     """A whole run; a break would fail it, for every graph is a full one."""
     # Where a core happens to be idle, another process would compile the same by Inductor.
-    monkeypatch.setattr(compile_ahead, "has_idle_core", lambda threads: False)
+    monkeypatch.setattr(compile_ahead, "has_idle_core", lambda threads, begun: False)
     torch._dynamo.utils.counters.clear()
     timed = replace(EVALUATE, latency_actions=2)
     config = with_sections(replace(CONFIG, compile=True), evaluate=timed)

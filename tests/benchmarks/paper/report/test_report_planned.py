@@ -155,6 +155,22 @@ def test_runs_without_the_number_that_is_compared_are_not_missing(tmp_path: Path
     assert line.endswith("**: not measured in 1 of 1 comparisons (not measured: pendulum).")
 
 
+def test_cells_of_the_twin_are_in_no_family_of_phihp(tmp_path: Path) -> None:
+    cells = [Cell("phihp", "pendulum", 100 + seed) for seed in range(3)]
+    twins = [Cell("phihp", "pendulum", 100, samples, "data-driven") for samples in (200, 500)]
+    make_planned(tmp_path, *cells)
+    plan(tmp_path, *cells)
+    make(tmp_path, tmp_path)
+    (before,) = table(tmp_path, "planning_gain")
+    plan(tmp_path, *twins)
+    make(tmp_path, tmp_path)
+    (after,) = table(tmp_path, "planning_gain")
+    assert after["p"] == before["p"]
+    assert {row["task, method, real samples"] for row in table(tmp_path, "planned")} == {
+        "pendulum, phihp", "pendulum, dd-phihp, 200", "pendulum, dd-phihp, 500"
+    }  # fmt: skip
+
+
 def test_planned_seeds_are_those_of_the_samples_that_are_compared(tmp_path: Path) -> None:
     few = [Cell("phihp", "pendulum", 100 + seed, 500) for seed in range(3)]
     usual = [Cell("phihp", "pendulum", 100 + seed) for seed in range(10)]
