@@ -155,7 +155,8 @@ def write_tables(results: Path) -> None:
     text = (
         "# Networks\n\nMade by `python benchmarks/paper/networks.py`. Do not edit. Returns are "
         "imagined, of the best actor. Seconds are of CPU time, one thread, from the first "
-        "evaluation on. Runs by default compile nothing; rows that did say so.\n"
+        "evaluation on. Runs by default compile nothing; rows that did say so. *Default* is what "
+        "the settings of its commit said, not those of today.\n"
     )
     for task in TARGETS:
         mine = [run for run in runs if run["task"] == task and run["done"]]
