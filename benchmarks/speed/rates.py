@@ -1,6 +1,6 @@
 """How long phases took in committed runs, for the expected duration that a run says first.
 
-    python benchmarks/speed/rates.py [results/runs-0.1.0 results/six_tasks ...]
+    python benchmarks/speed/rates.py [results/runs-0.1.0 results/runs results/times ...]
 
 It writes ``phihp_torchrl/trainers/rates.json``: by method, preset, task and phase, the 10th, 50th
 and 90th percentile over runs of the seconds for each unit of the setting that says how much work
@@ -69,4 +69,4 @@ def _three(values: list[float]) -> list[float]:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or ["results/runs-0.1.0", "results/six_tasks"])
+    main(sys.argv[1:] or ["results/runs-0.1.0", "results/runs", "results/times"])
