@@ -29,8 +29,7 @@ from phihp_torchrl.config import resolve_seconds
 from phihp_torchrl.evaluation import PUBLISHED, TARGETS, markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.tdmpc import TOLD, TDMPCAgent
-from phihp_torchrl.trainers import read_run_config
-from phihp_torchrl.trainers.model_config import make_dynamics
+from phihp_torchrl.trainers import make_dynamics, read_run_config
 
 RESULTS = Path("results/latency")
 TURNS, IN_A_TURN = 15, 10

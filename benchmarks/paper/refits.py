@@ -24,8 +24,7 @@ from phihp_torchrl import Agent, load_agent, load_config
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.evaluation import TARGETS, markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
-from phihp_torchrl.trainers import PolicyTrainer, read_run_config
-from phihp_torchrl.trainers.imagined_play import play
+from phihp_torchrl.trainers import PolicyTrainer, play, read_run_config
 
 AGENTS, RESULTS = Path("results/agents"), Path("results/refits")
 EPISODES = 24
