@@ -42,6 +42,8 @@ WAYS = {
     "TD3": ("td3", "paper"),
 }
 """Method and preset of each way to act."""
+_PAPERS = ("PhIHP", "TD-MPC", "TD3", "CEM-oracle")
+"""Those of which the paper has a time."""
 
 
 def untrained(task: str, method: str, preset: str, *, compile: bool) -> Agent:
@@ -123,9 +125,6 @@ def write_table(results: Path) -> None:
         "CEM-oracle's plan serves five actions. Published times are of an Apple M1."
         f"\n\n{markdown_table(header, rows)}\n\n{origins}.\n"
     )
-
-
-_PAPERS = ("PhIHP", "TD-MPC", "TD3", "CEM-oracle")
 
 
 def main() -> None:
