@@ -6,7 +6,8 @@
 Trains actor and critics in the fitted models of the agents in results/agents, by the task's default
 settings but for that fit, which some leave out. The plan of the default preset then plays paired
 imagined episodes with the critics as they were before their last fit to returns, and with the
-fitted ones. No real step is taken and no real episode played. Writes results/refits/{task}-seed{seed}.json and README.md.
+fitted ones. No real step is taken and no real episode played. Writes
+results/refits/{task}-seed{seed}.json and README.md.
 """
 
 from __future__ import annotations
