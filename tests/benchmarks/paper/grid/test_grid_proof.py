@@ -14,6 +14,7 @@ from grid_cells import TINY, do
 from grid import GridConfig, Status, committed
 from phihp_torchrl import origin
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.evaluation import PROOF_SEED
 from phihp_torchrl.trainers import RunDirectory
 from report import read_run
 
@@ -60,16 +61,18 @@ def test_nothing_but_proof_chooses_the_episodes(config: GridConfig, key: str, wo
 
 def test_episodes_that_were_chosen_unseen_end_the_cell(config: GridConfig) -> None:
     there = "evaluate.first_seed"
-    object.__setattr__(config, "overrides", (*TINY, f"{there}=2000100"))  # past checks of words
+    object.__setattr__(
+        config, "overrides", (*TINY, f"{there}={PROOF_SEED}")
+    )  # past checks of words
     state = do(config)
     assert state.status is Status.FAILED
-    assert f"{there}: expected 1000000 with proof=false, got 2000100" in state.detail
+    assert f"{there}: expected 1000000 with proof=false, got {PROOF_SEED}" in state.detail
 
 
 def test_a_proof_plays_the_episodes_that_are_kept_for_it(
     config: GridConfig, proof: GridConfig
 ) -> None:
-    assert "evaluate.first_seed=2000100" in proof.words()
+    assert f"evaluate.first_seed={PROOF_SEED}" in proof.words()
     assert not any(word.startswith("evaluate.first_seed") for word in config.words())
     with pytest.raises(ConfigError, match=r"allow_dirty: expected false with proof=true"):
         replace(proof, allow_dirty=True)
