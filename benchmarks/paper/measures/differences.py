@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean, stdev
 
 from scipy import stats
 
@@ -21,7 +22,8 @@ class Difference:
         low: lower end of its 95 % interval; NaN with fewer than two values on either side, and
             where no value varies.
         high: upper end.
-        p: two-sided p-value; NaN with fewer than :data:`FEWEST_SEEDS` values on either side.
+        p: two-sided p-value of no difference, or of the one asked about; NaN with fewer than
+            :data:`FEWEST_SEEDS` values on either side.
         seeds: number of values on either side.
         mixed: whether values of one side are of several configurations, or the two sides of other
             episodes; there is no p-value then.
@@ -33,6 +35,11 @@ class Difference:
     p: float
     seeds: tuple[int, int]
     mixed: bool = False
+
+    @property
+    def varies_nowhere(self) -> bool:
+        """Whether all seeds of a side agree, on both sides, and there are enough of them."""
+        return min(self.seeds) >= FEWEST_SEEDS and math.isnan(self.low)
 
     def within(self, margin: float) -> bool:
         """Whether the whole interval lies within ±``margin``: the two are equivalent by it.
@@ -47,18 +54,22 @@ class Difference:
         """
         if min(self.seeds) < FEWEST_SEEDS:
             return False
-        if math.isnan(self.low):
+        if self.varies_nowhere:
             return abs(self.mean) < margin
         return self.low > -margin and self.high < margin
 
 
-def difference(a: Sequence[float], b: Sequence[float], level: float = 0.95) -> Difference | None:
+def difference(
+    a: Sequence[float], b: Sequence[float], level: float = 0.95, *, least: float = 0.0
+) -> Difference | None:
     """``mean(a) − mean(b)`` of independent seeds, by Welch's t (unequal variances).
 
     Args:
         a: a value for each seed.
         b: a value for each seed of the other.
         level: of the interval.
+        least: the p-value is of the difference being this: minus a margin, where one asks
+            whether ``a`` is worse by no more.
 
     Returns:
         ``None`` where one of them has no value.
@@ -70,11 +81,12 @@ def difference(a: Sequence[float], b: Sequence[float], level: float = 0.95) -> D
     """
     if not a or not b:
         return None
-    mean, seeds = math.fsum(a) / len(a) - math.fsum(b) / len(b), (len(a), len(b))
+    mean, seeds = fmean(a) - fmean(b), (len(a), len(b))
     if min(seeds) < 2 or (len({*a}) == 1 and len({*b}) == 1):
         return Difference(mean, math.nan, math.nan, math.nan, seeds)
-    test = stats.ttest_ind(a, b, equal_var=False)
-    low, high = test.confidence_interval(level)
+    low, high = stats.ttest_ind(a, b, equal_var=False).confidence_interval(level)
+    moments = [fmean(a) - least, stdev(a), len(a), fmean(b), stdev(b), len(b)]
+    test = stats.ttest_ind_from_stats(*moments, equal_var=False)
     p = float(test.pvalue) if min(seeds) >= FEWEST_SEEDS else math.nan
     return Difference(mean, float(low), float(high), p, seeds)
 
@@ -95,7 +107,7 @@ def paired_difference_of_seeds(values: Sequence[float], level: float = 0.95) -> 
     """
     if not values:
         return None
-    mean, seeds = math.fsum(values) / len(values), (len(values), len(values))
+    mean, seeds = fmean(values), (len(values), len(values))
     if len(values) < 2 or len({*values}) == 1:
         return Difference(mean, math.nan, math.nan, math.nan, seeds)
     test = stats.ttest_1samp(values, 0.0)

@@ -10,6 +10,7 @@ from pathlib import Path
 from phihp_torchrl.config import ConfigError, check_count
 from phihp_torchrl.trainers import import_plugins
 from report.ablation import ablation
+from report.at_a_glance import at_a_glance
 from report.claims import claims_section
 from report.curves import imagined_curves, learning_curves
 from report.generalization import generalization
@@ -102,6 +103,7 @@ def make_report(config: ReportConfig) -> Report:
     results = Results(chosen, planned)
     sections = [
         _make("The paper's claims", lambda: claims_section(results), problems),
+        _make("At a glance", lambda: at_a_glance(results), problems),
         _make("Planned and done", lambda: planned_section(planned, chosen), problems),
         _make("Soundness", lambda: soundness(chosen), problems),
         _make("Main table", lambda: main_table(results), problems),

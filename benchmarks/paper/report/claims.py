@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
 from itertools import product
 from statistics import fmean
-from typing import NamedTuple
 
-from measures import (
-    FEWEST_SEEDS,
-    Between,
-    Difference,
-    holm,
-    mean_between,
-    ratio_between,
-    ratio_interval,
-)
+from measures import Between, mean_between, ratio_between
 from phihp_torchrl.evaluation import PUBLISHED
-from report.bounds import margin
-from report.cells import MIXED, is_mixed
+from report.bounds import EQUIVALENT, margin
+from report.cells import MIXED
 from report.comparison import compared
 from report.efficiency import efficiency_of_seeds, sample_efficiency
 from report.paper_systems import (
@@ -36,20 +25,26 @@ from report.paper_systems import (
     TD_MPC,
     TD_MPC_STAR,
     PaperSystem,
+    systems,
 )
 from report.planner_and_actor import planning_gain, usual_groups
 from report.results import TASKS, Results, Score, well_filled
 from report.sections import Section
 from report.tables import Table, TableCell
+from report.verdicts import (
+    NOT_MEASURED,
+    NOT_RUN,
+    NOT_SHOWN,
+    REFUTED,
+    SHOWN,
+    Finding,
+    Pair,
+    of_differences,
+    of_ratio,
+)
 
 FEWER = 5.0
 """The claim is of 5 to 15 times fewer samples."""
-
-LEVEL = 0.05
-"""Below this p-value, adjusted by Holm, a difference counts as significant."""
-
-SHOWN, NOT_SHOWN, REFUTED = "shown", "not shown", "refuted"
-NOT_RUN, NOT_MEASURED = "not run", "not measured"
 
 _PAIRS = (
     (PHIHP, DD_PHIHP),
@@ -57,50 +52,6 @@ _PAIRS = (
     (PH_CEM, DD_CEM),
     (PH_TD_MPC_STAR, TD_MPC_STAR),
 )
-
-
-class _Pair(NamedTuple):
-    """A comparison of mean returns, as it is tested in its family.
-
-    Attributes:
-        what: its name.
-        task: whose returns they are.
-        gap: the difference; ``None`` where a side has no run, or none that says it.
-        seeds: of either side, as a finding has them.
-        planned: whether grids were asked for both sides.
-        absent: the verdict where there is no difference.
-    """
-
-    what: str
-    task: str
-    gap: Difference | None
-    seeds: str
-    planned: bool
-    absent: str = NOT_RUN
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What one comparison says on a claim.
-
-    Args:
-        what: the task, or the systems and the task.
-        verdict: :data:`SHOWN`, :data:`NOT_SHOWN` or :data:`REFUTED`, or
-            :data:`~report.cells.MIXED` where runs are compared that cannot be, or :data:`NOT_RUN`
-            where a side was planned and has no run, or :data:`NOT_MEASURED` where both have runs
-            and those of a side do not say what is compared.
-        effect: its size, in words.
-        ends: what the effect lies between, where it is known by its ends alone.
-        interval: its 95 % interval over training seeds.
-        seeds: number of training seeds on either side, and of how many where more were planned.
-    """
-
-    what: str
-    verdict: str
-    effect: str
-    ends: str
-    interval: str
-    seeds: str
 
 
 def claims_section(results: Results) -> Section:
@@ -113,8 +64,18 @@ def claims_section(results: Results) -> Section:
         "Planning improves on the policy": planning_improves(results),
         "The hybrid model beats the data-driven one at equal samples": hybrid_earns_more(results),
         "PhIHP acts faster than TD-MPC": faster(results),
+        f"PhIHP earns as much as each baseline, to {EQUIVALENT:.0%} of a task's range": not_worse(
+            results
+        ),
     }
-    sides = (((PHIHP, TD_MPC),), ((PHIHP, TD3),), ((PHIHP,),), _PAIRS, ((PHIHP, TD_MPC),))
+    sides = (
+        ((PHIHP, TD_MPC),),
+        ((PHIHP, TD3),),
+        ((PHIHP,),),
+        _PAIRS,
+        ((PHIHP, TD_MPC),),
+        [(PHIHP, baseline) for baseline in systems("baseline")],
+    )
     lines = [
         f"- **{claim}**: {sentence(findings, done=_any_done(results, systems))}"
         for (claim, findings), systems in zip(claims.items(), sides, strict=True)
@@ -172,7 +133,7 @@ def fewer_samples(results: Results) -> list[Finding]:
         if ours and theirs:
             between = mean_between(theirs), mean_between(ours)
             findings.append(
-                _of_ratio(
+                of_ratio(
                     task,
                     (theirs, ours),
                     ratio_between(*between),
@@ -196,8 +157,8 @@ def planning_improves(results: Results) -> list[Finding]:
         seeds = ", ".join([_of_planned(len(group), planned)] * 2)
         gap = planning_gain(group) if group else None
         absent = NOT_MEASURED if results.has_run(PHIHP, task) else NOT_RUN
-        pairs.append(_Pair(task, task, gap, seeds, planned > 0, absent))
-    return _of_differences(pairs)
+        pairs.append(Pair(task, task, gap, seeds, planned > 0, absent))
+    return of_differences(pairs)
 
 
 def faster(results: Results) -> list[Finding]:
@@ -208,7 +169,7 @@ def faster(results: Results) -> list[Finding]:
         ours, theirs = (_times(each) for each in scores)
         if ours and theirs:
             findings.append(
-                _of_ratio(
+                of_ratio(
                     task,
                     ([Between(t, t) for t in theirs], [Between(t, t) for t in ours]),
                     Between(min(theirs) / max(ours), max(theirs) / min(ours)),
@@ -230,8 +191,8 @@ def earns_more(results: Results, first: PaperSystem, second: PaperSystem) -> lis
         sides = results.usual(first, task), results.usual(second, task)
         seeds = _seeds(results, (first, second), task, sides, *map(_samples, sides))
         planned = results.planned.both(first, second, task)
-        found.append(_Pair(task, task, compared(*sides), seeds, planned))
-    return _of_differences(found)
+        found.append(Pair(task, task, compared(*sides), seeds, planned))
+    return of_differences(found)
 
 
 def hybrid_earns_more(results: Results) -> list[Finding]:
@@ -243,65 +204,27 @@ def hybrid_earns_more(results: Results) -> list[Finding]:
             sides = results.at(number, first, task), results.at(number, second, task)
             seeds = _seeds(results, (first, second), task, sides, {number}, {number})
             what = f"{first.name} on {task}, {number} samples"
-            found.append(_Pair(what, task, compared(*sides), seeds, number in asked))
-    return _of_differences(found)
+            found.append(Pair(what, task, compared(*sides), seeds, number in asked))
+    return of_differences(found)
 
 
-def _of_differences(pairs: Sequence[_Pair]) -> list[Finding]:
-    """Findings of one family of tests, by Holm; those that were planned count, tested or not."""
-    findings = []
-    p_values = [math.nan if pair.gap is None else pair.gap.p for pair in pairs]
-    family = sum(pair.planned or not math.isnan(p) for pair, p in zip(pairs, p_values, strict=True))
-    for pair, p in zip(pairs, holm(p_values, family), strict=True):
-        what, task, gap, seeds, planned, absent = pair
-        if gap is None:
-            findings += [Finding(what, absent, "–", "–", "–", seeds)] if planned else []
-            continue
-        verdict = NOT_SHOWN if not p < LEVEL else SHOWN if gap.mean > 0 else REFUTED
-        if gap.mixed:
-            verdict = MIXED
-        effect = _text(gap.mean, "+") + ("" if math.isnan(p) else f", p = {p:.2g}")
-        within = margin(task)
-        if verdict == NOT_SHOWN and within is not None and gap.within(within):
-            effect += ", equivalent"
-        ends = "–" if math.isnan(gap.low) else f"{_text(gap.low)} to {_text(gap.high)}"
-        findings.append(Finding(what, verdict, effect, "–", ends, seeds))
-    return findings
+def not_worse(results: Results) -> list[Finding]:
+    """Whether PhIHP's mean return is below no baseline's by the margin, by task.
 
-
-def _of_ratio(
-    what: str,
-    sides: tuple[Sequence[Between], Sequence[Between]],
-    ratio: Between,
-    least: float,
-    effect: str,
-    scores: Iterable[Score],
-    seeds: str,
-) -> Finding:
-    """Shown where the ratio is at least ``least`` by its ends and by its interval, or refuted.
-
-    What a ratio lies between says nothing of how it varies from seed to seed, so that its interval
-    over seeds must agree. Fewer than :data:`~measures.FEWEST_SEEDS` on either side show nothing.
-
-    Args:
-        what: the task.
-        sides: what the number of each seed lies between, above and below.
-        ratio: what the ratio lies between.
-        least: the claim is that it is this or more.
-        effect: its size, in words.
-        scores: those of either side, which may be mixed.
-        seeds: of either side, as a finding has them.
+    The difference plus the margin is tested, so that *shown* needs more than a small difference.
     """
-    interval = ratio_interval(*sides)
-    verdict = NOT_SHOWN
-    if is_mixed(score.run for score in scores):
-        verdict = MIXED
-    elif min(map(len, sides)) >= FEWEST_SEEDS:
-        if ratio.low >= least and interval.low > least:
-            verdict = SHOWN
-        elif ratio.high < least and interval.high < least:
-            verdict = REFUTED
-    return Finding(what, verdict, effect, _times_text(ratio), _times_text(interval), seeds)
+    found = []
+    for baseline, task in product(systems("baseline"), TASKS):
+        within = margin(task)
+        if within is None:
+            continue
+        sides = results.usual(PHIHP, task), results.usual(baseline, task)
+        seeds = _seeds(results, (PHIHP, baseline), task, sides, *map(_samples, sides))
+        planned = results.planned.both(PHIHP, baseline, task)
+        gap = compared(*sides, least=-within)
+        what = f"{baseline.name} on {task}"
+        found.append(Pair(what, task, gap, seeds, planned, least=-within))
+    return of_differences(found)
 
 
 def _absent(
@@ -343,11 +266,6 @@ def _of_planned(found: int, planned: int) -> str:
     return f"{found} of {planned}" if planned > found else str(found)
 
 
-def _times_text(ratio: Between) -> str:
-    above = " and more" if math.isinf(ratio.high) else f" to {ratio.high:.1f}"
-    return f"{ratio.low:.1f}{above} times"
-
-
 def _samples(scores: Iterable[Score]) -> set[int]:
     return {score.run.samples for score in scores}
 
@@ -374,7 +292,3 @@ def _published_samples(results: Results) -> str:
             parts.append(f"{task} {ours} against {1000 * published.samples:.0f}")
     return f"Samples to 90 %, PhIHP's against TD-MPC's as published: {', '.join(parts)}." if parts \
         else ""  # fmt: skip
-
-
-def _text(value: float, sign: str = "") -> str:
-    return f"{value:{sign}.1f}".replace("-", "−")

@@ -18,9 +18,18 @@ def unless_mixed(found: Difference, runs: Iterable[Run]) -> Difference:
     return replace(found, p=math.nan, mixed=True) if is_mixed(runs) else found
 
 
-def compared(ours: Sequence[Score], theirs: Sequence[Score]) -> Difference | None:
-    """The difference of mean returns; ``None`` where a side has no run."""
-    found = difference([score.mean for score in ours], [score.mean for score in theirs])
+def compared(
+    ours: Sequence[Score], theirs: Sequence[Score], *, least: float = 0.0
+) -> Difference | None:
+    """The difference of mean returns; ``None`` where a side has no run.
+
+    Args:
+        ours: a score for each seed.
+        theirs: those that are taken off.
+        least: what the p-value asks about (:func:`~measures.difference`).
+    """
+    sides = ([score.mean for score in side] for side in (ours, theirs))
+    found = difference(*sides, least=least)
     return found and unless_mixed(found, [score.run for score in (*ours, *theirs)])
 
 

@@ -17,7 +17,6 @@ from report.paper_systems import PaperSystem
 from report.runs import Run
 from report.sections import Section
 from report.tables import Number, Table, TableCell
-from report.twin import read_as
 
 _LONGEST = 160
 """Characters of an error in a table; all of it is in ``failure.json``."""
@@ -55,7 +54,7 @@ class Planned:
 
     def of(self, label: str) -> Planned:
         """The cells with one label."""
-        cells = (cell for cell in self.cells if read_as(cell.method, cell.label)[1] == label)
+        cells = (cell for cell in self.cells if cell.label == label)
         return replace(self, cells=tuple(cells))
 
     def seeds(self, system: PaperSystem, task: str, samples: Collection[int] = ()) -> int:
@@ -93,11 +92,7 @@ class Planned:
     def _cells(self, system: PaperSystem, task: str) -> list[Cell]:
         """Those of any of a system's methods on a task."""
         methods = {method for method, _ in system.sources}
-        return [
-            cell
-            for cell in self.cells
-            if cell.task == task and read_as(cell.method, cell.label)[0] in methods
-        ]
+        return [cell for cell in self.cells if cell.task == task and cell.method in methods]
 
 
 def read_planned(directory: Path) -> Planned:
@@ -117,8 +112,7 @@ def planned_section(planned: Planned, runs: Sequence[Run]) -> Section:
     done = {run.folder.name: run for run in runs}
     groups: dict[tuple[str, str, int], list[Cell]] = defaultdict(list)
     for cell in planned.cells:
-        method, _ = read_as(cell.method, cell.label)
-        groups[cell.task, method, cell.samples or 0].append(cell)
+        groups[cell.task, cell.method, cell.samples or 0].append(cell)
     rows: list[list[TableCell]] = []
     for (task, method, samples), cells in sorted(groups.items()):
         made = [done[cell.name] for cell in cells if cell.name in done]

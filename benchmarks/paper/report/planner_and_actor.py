@@ -21,7 +21,6 @@ from report.results import usual_samples
 from report.runs import Run
 from report.sections import Section
 from report.tables import Number, Stat, Table, TableCell
-from report.twin import read_as
 
 _SHARES = {"all samples": 1.0, "a half": 0.5, "a fifth": 0.2, "a tenth": 0.1}
 _WAYS = (AGENT, "actor")
@@ -97,11 +96,7 @@ def acting_section(runs: Sequence[Run], planned: Planned | None = None) -> Secti
 def _gain_table(groups: dict[tuple[str, int], list[Run]], planned: Planned) -> Table:
     found = {key: planning_gain(group) for key, group in groups.items()}
     tested = {key for key, gain in found.items() if not math.isnan(gain.p)}
-    asked = {
-        (cell.task, samples_of(cell))
-        for cell in planned.cells
-        if read_as(cell.method, cell.label)[0] == "phihp"
-    }
+    asked = {(cell.task, samples_of(cell)) for cell in planned.cells if cell.method == "phihp"}
     adjusted = holm([gain.p for gain in found.values()], len(tested | asked))
     rows: list[list[TableCell]] = [
         [task, str(samples), *numbers(gain, p, 2), str(gain.seeds[0])]

@@ -19,7 +19,6 @@ from grid.status import read_failure
 from measures import CurvePoint, configuration_hash, curve_from_metrics, read_curve
 from phihp_torchrl.evaluation import BASELINES_KEY, EVALUATION_SEED
 from phihp_torchrl.origin import commit_text, machine_text
-from report.twin import read_as
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # a report reads hundreds of files
 
@@ -149,7 +148,7 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
     method, task = config.get("method", DEFAULT_METHOD), config["task"]
     world = (config.get("world") or {}).get("kind", "simulated")
     kind = (config.get("model") or {}).get("kind")
-    method, label = read_as(method, cell.get("label") or _label(folder.name, task, method))
+    label = cell.get("label") or _label(folder.name, task, method)
     if method == "dd-phihp" and kind != "data_driven":
         raise ValueError(f"model.kind: expected 'data_driven' for {method}, got {kind!r}.")
     return Run(

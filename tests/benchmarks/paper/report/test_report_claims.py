@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from kept_runs import make, make_run, results, table, text
 
 from report import read_runs
-from report.claims import claims_section, fewer_samples, hybrid_earns_more, planning_improves
+from report.claims import (
+    claims_section,
+    fewer_samples,
+    hybrid_earns_more,
+    not_worse,
+    planning_improves,
+)
 from report.paper_systems import (
     DD_CEM,
     PH_CEM,
@@ -141,12 +148,40 @@ def test_a_cell_of_several_configurations_gets_no_verdict(tmp_path: Path) -> Non
         "2, pendulum": "mixed",
         "3, pendulum": "mixed",
         "5, pendulum": "mixed",
+        "6, TD-MPC on pendulum": "mixed",
+        "6, TD3 on pendulum": "mixed",
     }
     assert rows["3, pendulum"][2] == "+9.0", "no p"
     assert "mixed in 1 of 1 comparisons (mixed: pendulum)" in section.text
     make(tmp_path)
     assert table(tmp_path, "planning_gain")[0]["p"] == "mixed"
     assert table(tmp_path, "differences")[0]["p"] == "mixed"
+
+
+@pytest.mark.parametrize(
+    ("worse_by", "spread", "verdict"),
+    [
+        (0.0, 0.1, "shown"),
+        (0.0, 0.0, "shown"),  # nothing varies: both keep the pole up
+        (0.0, 9.0, "not shown"),  # as much on average, but nobody knows
+        (4.9, 0.0, "shown"),
+        (4.9, 0.1, "not shown"),
+        (5.1, 0.0, "refuted"),
+        (9.0, 0.1, "refuted"),
+    ],
+)
+def test_what_is_worse_by_less_than_the_margin_is_as_good(
+    tmp_path: Path, worse_by: float, spread: float, verdict: str
+) -> None:
+    """The margin of CartPole is 1 % of 500."""
+    for seed, way in enumerate((-1.0, 0.0, 1.0)):
+        ours = 490.0 + spread * way
+        acting = {"planner": [ours], "actor": [ours]}
+        make_run(tmp_path, task="cartpole", seed=seed, samples=2500, acting=acting)
+        theirs = {"actor": [490.0 + worse_by - spread * way]}
+        make_run(tmp_path, "td3", task="cartpole", seed=seed, samples=9000, acting=theirs)
+    (finding,) = not_worse(results(tmp_path))
+    assert (finding.what, finding.verdict) == ("TD3 on cartpole", verdict)
 
 
 def test_a_comparison_has_one_verdict(tmp_path: Path) -> None:
@@ -172,14 +207,13 @@ def test_equal_samples_are_those_with_enough_seeds(tmp_path: Path) -> None:
 
 
 def test_the_hybrid_is_compared_at_few_samples_and_at_many(tmp_path: Path) -> None:
-    """Its twin without a prior was made by a grid of PhIHP with that setting, as label says."""
     for seed in (0, 1, 2):
         for samples, gain in ((100, 9.0), (1000, 0.1)):
             ours = {"planner": [5.0 + gain + 0.1 * seed], "actor": [4.0 + gain + 0.1 * seed]}
             make_run(tmp_path, seed=seed, samples=samples, acting=ours)
             more = (0.0, 0.5, -0.5)[seed]
             theirs = {"planner": [5.0 + more], "actor": [4.0 + more]}
-            make_run(tmp_path, seed=seed, samples=samples, acting=theirs, label="data-driven",
+            make_run(tmp_path, "dd-phihp", seed=seed, samples=samples, acting=theirs,
                      kind="data_driven")  # fmt: skip
     found = {finding.what: finding for finding in hybrid_earns_more(results(tmp_path))}
     assert {name: (f.verdict, f.effect.split(",")[0]) for name, f in found.items()} == {
@@ -191,7 +225,7 @@ def test_the_hybrid_is_compared_at_few_samples_and_at_many(tmp_path: Path) -> No
 
 
 def test_a_twin_that_has_a_prior_is_left_out(tmp_path: Path) -> None:
-    make_run(tmp_path, label="data-driven", kind="hybrid")
+    make_run(tmp_path, "dd-phihp", kind="hybrid")
     folders = read_runs(tmp_path)
     assert not folders.runs
     assert "model.kind: expected 'data_driven' for dd-phihp, got 'hybrid'" in folders.problems[0]
@@ -214,6 +248,8 @@ def test_cells_of_other_episodes_are_not_compared(tmp_path: Path) -> None:
         "2, pendulum": "mixed",
         "3, pendulum": "shown",  # planner and actor of one cell
         "5, pendulum": "mixed",
+        "6, TD-MPC on pendulum": "mixed",
+        "6, TD3 on pendulum": "mixed",
     }
     make(tmp_path)
     compared = [row for row in table(tmp_path, "differences") if row["seeds"] == "3, 3"]

@@ -157,7 +157,7 @@ def test_runs_without_the_number_that_is_compared_are_not_missing(tmp_path: Path
 
 def test_cells_of_the_twin_are_in_no_family_of_phihp(tmp_path: Path) -> None:
     cells = [Cell("phihp", "pendulum", 100 + seed) for seed in range(3)]
-    twins = [Cell("phihp", "pendulum", 100, samples, "data-driven") for samples in (200, 500)]
+    twins = [Cell("dd-phihp", "pendulum", 100, samples) for samples in (200, 500)]
     make_planned(tmp_path, *cells)
     plan(tmp_path, *cells)
     make(tmp_path, tmp_path)
