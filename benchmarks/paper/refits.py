@@ -12,7 +12,6 @@ results/refits/{task}-seed{seed}.json and README.md.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -20,14 +19,12 @@ from typing import Any
 
 import torch
 
-from measures import paired_difference
-from phihp_torchrl import Agent, load_agent, load_config
-from phihp_torchrl.dynamics import TaskWorldModel
+from measures import paired_difference, study, train
 from phihp_torchrl.evaluation import TARGETS, markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
-from phihp_torchrl.trainers import PolicyTrainer, play, read_run_config
+from phihp_torchrl.trainers import PolicyTrainer
 
-AGENTS, RESULTS = Path("results/agents"), Path("results/refits")
+RESULTS = Path("results/refits")
 EPISODES = 24
 FIT = "policy.refit.interval=2000"
 """A fit at the end, also where the task's settings leave it out; any number above 0 says so."""
@@ -48,28 +45,17 @@ class LastFit(PolicyTrainer):
 
 def measure(task: str, seed: int) -> dict[str, Any]:
     """Train, and play both plans."""
-    agent = load_agent(AGENTS / task, packaged=False)
-    config = read_run_config(load_config(task, overrides=[FIT]))
-    torch.manual_seed(seed)
-    assert agent.dynamics is not None  # of an agent that was trained in it
-    start = time.process_time()
-    trainer = LastFit(agent.task, agent.dynamics, config.section("policy"), seed=seed)
-    while not trainer.done:
-        trainer.advance()
-    seconds = time.process_time() - start
-    model = TaskWorldModel(agent.task, agent.dynamics)
-    states = agent.task.sample_start([EPISODES], torch.Generator().manual_seed(seed))
-    returns = {}
-    for name, critics in (("before", trainer.unfitted), ("fitted", trainer.best_qvalue())):
-        parts = {"dynamics": agent.dynamics, "actor": trainer.best_actor(), "qvalue": critics}
-        plan = Agent(agent.task, **parts, planner_config=config.planner)
-        returns[name] = play(plan, model, states, seed=seed).total.tolist()
+    trained = train(task, seed, [FIT], LastFit)
+    trainer = trained.trainer
     return {
         "task": task,
         "seed": seed,
-        "returns": returns,
+        "returns": {
+            "before": trained.plan(EPISODES, qvalue=trainer.unfitted),
+            "fitted": trained.plan(EPISODES),
+        },
         "seconds_of_fits": trainer.seconds_of_fits,
-        "seconds": seconds,
+        "seconds": trained.seconds,
         "origin": describe_origin(seed),
     }
 
@@ -105,27 +91,5 @@ def write_table(results: Path) -> None:
     )
 
 
-def main() -> None:
-    """Measure what is missing, and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[20, 21])
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--only-write", action="store_true")
-    options = parser.parse_args()
-    options.results.mkdir(parents=True, exist_ok=True)
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
-    for seed in () if options.only_write else options.seeds:
-        for task in options.tasks:
-            path = options.results / f"{task}-seed{seed}.json"
-            if path.is_file():
-                continue
-            found = measure(task, seed)
-            path.write_text(json.dumps(found) + "\n")
-            print(path.stem, found["seconds_of_fits"], flush=True)
-    write_table(options.results)
-
-
 if __name__ == "__main__":
-    main()
+    study(__doc__.splitlines()[0], RESULTS, measure, write_table)

@@ -11,7 +11,6 @@ results/searches/{task}-seed{seed}.json and README.md.
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from pathlib import Path
@@ -19,15 +18,14 @@ from typing import Any
 
 import torch
 
-from measures import paired_difference
-from phihp_torchrl import Agent, load_agent, load_config
-from phihp_torchrl.dynamics import TaskWorldModel
+from measures import paired_difference, study, train
+from phihp_torchrl import load_config
 from phihp_torchrl.evaluation import TARGETS, markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
-from phihp_torchrl.trainers import PolicyTrainer, play, read_run_config
+from phihp_torchrl.trainers import PolicyTrainer, read_run_config
 
-AGENTS, RESULTS = Path("results/agents"), Path("results/searches")
-EPISODES = 48
+RESULTS = Path("results/searches")
+EPISODES = 32
 PRESET = [
     "planner.planning_horizon=50",
     "planner.optim_steps=1",
@@ -57,25 +55,12 @@ SEARCHES = {
 
 def measure(task: str, seed: int) -> dict[str, Any]:
     """Train once, and play the plans of all searches."""
-    agent = load_agent(AGENTS / task, packaged=False)
-    config = read_run_config(load_config(task))
-    torch.manual_seed(seed)
-    assert agent.dynamics is not None  # of an agent that was trained in it
-    trainer = PolicyTrainer(agent.task, agent.dynamics, config.section("policy"), seed=seed)
-    while not trainer.done:
-        trainer.advance()
-    parts = {
-        "dynamics": agent.dynamics,
-        "actor": trainer.best_actor(),
-        "qvalue": trainer.best_qvalue(),
-    }
-    model = TaskWorldModel(agent.task, agent.dynamics)
-    states = agent.task.sample_start([EPISODES], torch.Generator().manual_seed(seed))
+    trained = train(task, seed, [], PolicyTrainer)
     returns, seconds = {}, {}
     for name, changes in SEARCHES.items():
         search = read_run_config(load_config(task, overrides=[*PRESET, *changes])).planner
-        plan, start = Agent(agent.task, **parts, planner_config=search), time.process_time()
-        returns[name] = play(plan, model, states, seed=seed).total.tolist()
+        start = time.process_time()
+        returns[name] = trained.plan(EPISODES, search)
         seconds[name] = time.process_time() - start
     return {
         "task": task,
@@ -118,27 +103,5 @@ def write_table(results: Path) -> None:
     )
 
 
-def main() -> None:
-    """Measure what is missing, and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[20, 21])
-    parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--only-write", action="store_true")
-    options = parser.parse_args()
-    options.results.mkdir(parents=True, exist_ok=True)
-    torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
-    for seed in () if options.only_write else options.seeds:
-        for task in options.tasks:
-            path = options.results / f"{task}-seed{seed}.json"
-            if path.is_file():
-                continue
-            found = measure(task, seed)
-            path.write_text(json.dumps(found) + "\n")
-            print(path.stem, flush=True)
-    write_table(options.results)
-
-
 if __name__ == "__main__":
-    main()
+    study(__doc__.splitlines()[0], RESULTS, measure, write_table)

@@ -1,0 +1,45 @@
+"""Policies that are trained in fitted models, for studies without a real step."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from measures import study, train
+from phihp_torchrl.planners import CEMConfig
+from phihp_torchrl.trainers import PolicyTrainer
+
+TINY = ["policy.updates=8", "policy.random_steps=64", "policy.num_worlds=8", "policy.batch_size=8",
+        "policy.evaluation_interval=8", "policy.evaluation_episodes=2", "policy.planned=0",
+        "policy.evaluation_steps=5", "policy.refit.interval=0"]  # fmt: skip
+
+
+def test_plans_of_one_training_play_the_same_episodes() -> None:
+    trained = train("pendulum", 3, TINY, PolicyTrainer)
+    search = CEMConfig(planning_horizon=2, num_candidates=8, num_policy_candidates=2, top_k=2)
+    returns = trained.plan(2, search)
+    assert len(returns) == 2
+    assert trained.plan(2, search) == returns
+    other = CEMConfig(planning_horizon=2, num_candidates=8, num_policy_candidates=0, top_k=2)
+    assert trained.plan(2, other) != returns
+
+
+def test_a_study_measures_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: list[tuple[str, int]] = []
+
+    def measure(task: str, seed: int) -> dict[str, int]:
+        measured.append((task, seed))
+        return {"seed": seed}
+
+    def write_table(results: Path) -> None:
+        found = [json.loads(path.read_text())["seed"] for path in sorted(results.glob("*.json"))]
+        (results / "README.md").write_text(str(found))
+
+    for seeds in (["4"], ["4", "5"]):
+        words = ["study", "--tasks", "acrobot", "--seeds", *seeds, "--results", str(tmp_path)]
+        monkeypatch.setattr("sys.argv", words)
+        study("A study.", tmp_path / "unused", measure, write_table)
+    assert measured == [("acrobot", 4), ("acrobot", 5)]
+    assert (tmp_path / "README.md").read_text() == "[4, 5]"
