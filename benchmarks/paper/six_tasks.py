@@ -1,6 +1,6 @@
 r"""What a user of the defaults gets on the six tasks: returns, smoothness, and the time it takes.
 
-    python benchmarks/paper/run_grid.py proof=true 'seed=range(140,150)' share=0.5 \
+    python benchmarks/paper/run_grid.py proof=true 'seed=range(150,160)' share=0.5 \
         task=pendulum,pendulum-swingup,cartpole,cartpole-swingup,acrobot,acrobot-swingup
     python benchmarks/paper/six_tasks.py
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from phihp_torchrl.config import ConfigError, check_count
 from phihp_torchrl.trainers import import_plugins
 from report.ablation import ablation
+from report.action_times import read_turns
 from report.at_a_glance import at_a_glance
 from report.claims import claims_section
 from report.curves import imagined_curves, learning_curves
@@ -38,6 +39,7 @@ class ReportConfig:
     Args:
         runs: directory with a folder for each run.
         sensitivity: directory of ``sensitivity.py``'s data.
+        latency: directory of ``latency.py``'s data.
         benchmarks: what ``make bench`` wrote.
         out: directory of the report.
         label: the settings whose runs it is on.
@@ -50,6 +52,7 @@ class ReportConfig:
 
     runs: str = "results/runs"
     sensitivity: str = "results/sensitivity"
+    latency: str = "results/latency"
     benchmarks: str = "results/benchmarks/benchmarks.json"
     out: str = "results/report"
     label: str = "default"
@@ -90,6 +93,7 @@ def make_report(config: ReportConfig) -> Report:
     import_plugins(config.plugins)
     folders = read_runs(Path(config.runs), any_version=config.any_version)
     trials, unread = read_trials(Path(config.sensitivity))
+    turns = read_turns(Path(config.latency))
     problems = [*folders.problems, *unread]
     if not folders.runs and any(path.is_dir() for path in Path(config.runs).glob("*")):
         raise ConfigError(
@@ -102,7 +106,7 @@ def make_report(config: ReportConfig) -> Report:
     planned = every.of(config.label)
     results = Results(chosen, planned)
     sections = [
-        _make("The paper's claims", lambda: claims_section(results), problems),
+        _make("The paper's claims", lambda: claims_section(results, turns), problems),
         _make("At a glance", lambda: at_a_glance(results), problems),
         _make("Planned and done", lambda: planned_section(planned, chosen), problems),
         _make("Soundness", lambda: soundness(chosen), problems),

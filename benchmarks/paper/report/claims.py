@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from itertools import product
-from statistics import fmean
 
-from measures import Between, mean_between, ratio_between
+from measures import mean_between, ratio_between
 from phihp_torchrl.evaluation import PUBLISHED
+from report.action_times import Turns, faster
 from report.bounds import EQUIVALENT, margin
 from report.cells import MIXED
 from report.comparison import compared
@@ -54,8 +54,13 @@ _PAIRS = (
 )
 
 
-def claims_section(results: Results) -> Section:
-    """A sentence for each claim, and a row for each comparison."""
+def claims_section(results: Results, turns: Turns | None = None) -> Section:
+    """A sentence for each claim, and a row for each comparison.
+
+    Args:
+        results: the scores, and what was planned.
+        turns: times of an action (:func:`~report.action_times.read_turns`).
+    """
     claims = {
         f"PhIHP needs at least {FEWER:.0f} times fewer real samples than TD-MPC": fewer_samples(
             results
@@ -63,7 +68,7 @@ def claims_section(results: Results) -> Section:
         "PhIHP earns more than TD3": earns_more(results, PHIHP, TD3),
         "Planning improves on the policy": planning_improves(results),
         "The hybrid model beats the data-driven one at equal samples": hybrid_earns_more(results),
-        "PhIHP acts faster than TD-MPC": faster(results),
+        "PhIHP acts faster than TD-MPC": faster(turns or {}),
         f"PhIHP earns as much as each baseline, to {EQUIVALENT:.0%} of a task's range": not_worse(
             results
         ),
@@ -73,7 +78,7 @@ def claims_section(results: Results) -> Section:
         ((PHIHP, TD3),),
         ((PHIHP,),),
         _PAIRS,
-        ((PHIHP, TD_MPC),),
+        (),
         [(PHIHP, baseline) for baseline in systems("baseline")],
     )
     lines = [
@@ -159,29 +164,6 @@ def planning_improves(results: Results) -> list[Finding]:
         absent = NOT_MEASURED if results.has_run(PHIHP, task) else NOT_RUN
         pairs.append(Pair(task, task, gap, seeds, planned > 0, absent))
     return of_differences(pairs)
-
-
-def faster(results: Results) -> list[Finding]:
-    """TD-MPC's time of an action over PhIHP's, by task, over all pairs of runs."""
-    findings = []
-    for task in TASKS:
-        scores = [results.usual(system, task) for system in (PHIHP, TD_MPC)]
-        ours, theirs = (_times(each) for each in scores)
-        if ours and theirs:
-            findings.append(
-                of_ratio(
-                    task,
-                    ([Between(t, t) for t in theirs], [Between(t, t) for t in ours]),
-                    Between(min(theirs) / max(ours), max(theirs) / min(ours)),
-                    1.0,
-                    f"{fmean(ours):.1f} ms against {fmean(theirs):.1f}",
-                    [score for side in scores for score in side],
-                    _seeds(results, (PHIHP, TD_MPC), task, (ours, theirs), *map(_samples, scores)),
-                )
-            )
-        elif results.planned.both(PHIHP, TD_MPC, task):
-            findings.append(_absent(results, (PHIHP, TD_MPC), task, scores))
-    return findings
 
 
 def earns_more(results: Results, first: PaperSystem, second: PaperSystem) -> list[Finding]:
@@ -276,10 +258,6 @@ def _equal_samples(
     """The numbers of real samples that two systems have in common, with enough seeds if any has."""
     both = (results.scores(system, task) for system in (first, second))
     return well_filled(*([score.run.samples for score in scores] for scores in both))
-
-
-def _times(scores: Sequence[Score]) -> list[float]:
-    return [score.milliseconds for score in scores if score.milliseconds is not None]
 
 
 def _published_samples(results: Results) -> str:

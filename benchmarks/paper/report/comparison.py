@@ -28,8 +28,8 @@ def compared(
         theirs: those that are taken off.
         least: what the p-value asks about (:func:`~measures.difference`).
     """
-    sides = ([score.mean for score in side] for side in (ours, theirs))
-    found = difference(*sides, least=least)
+    a, b = ([score.mean for score in side] for side in (ours, theirs))
+    found = difference(a, b, least=least)
     return found and unless_mixed(found, [score.run for score in (*ours, *theirs)])
 
 

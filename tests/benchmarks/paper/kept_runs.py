@@ -77,6 +77,7 @@ def make(tmp_path: Path, runs: Path | None = None, **changes) -> Report:
     config = ReportConfig(
         runs=str(runs or tmp_path / "runs"),
         sensitivity=str(tmp_path / "sensitivity"),
+        latency=str(tmp_path / "latency"),
         out=str(tmp_path / "report"),
         reps=50,
         overview=str(tmp_path / "overview.md"),

@@ -18,6 +18,7 @@ from report import (
     read_run,
     read_runs,
 )
+from report.action_times import read_turns
 from report.claims import claims_section
 from report.main_table import main_table
 from report.overview import END, START
@@ -142,7 +143,7 @@ def test_the_committed_report_is_that_of_the_committed_runs() -> None:
     results = Results(chosen, read_planned(place).of("default"))
     sections = (
         main_table(results),
-        claims_section(results),
+        claims_section(results, read_turns(ROOT / "results" / "latency")),
         acting_section(results.runs, results.planned),
     )
     for section in sections:
