@@ -171,7 +171,6 @@ def report_files(place: Path, compared: Path) -> dict[str, bytes]:
             out=str(compared / "report"),
             reps=50,
             overview=str(compared / "overview.md"),
-            page=None,
         )
     )
     paths = sorted(path for path in compared.rglob("*") if path.is_file())

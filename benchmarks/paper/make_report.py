@@ -2,8 +2,8 @@
 
     python benchmarks/paper/make_report.py
 
-Writes results/report/ (Markdown, CSV, SVG, PNG) and results/README.md; with ``page=FILE`` the table
-of returns goes between the markers of another page too. ``config/report.yaml`` has every key.
+Writes results/report/ (Markdown, CSV, SVG, PNG) and results/README.md. ``config/report.yaml`` has
+every key.
 """
 
 from __future__ import annotations

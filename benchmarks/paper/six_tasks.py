@@ -21,14 +21,14 @@ from pathlib import Path
 from statistics import median
 
 from measures import agent_in, paired_difference_of_seeds
-from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, markdown_table
+from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, TARGETS, markdown_table
 from report.cells import configurations
-from report.overview import END, START, origins, put_between
+from report.overview import origins, put_between
 from report.runs import Run, read_runs
 
 RESULTS = Path("results/runs")
-TASKS = ("pendulum", "pendulum-swingup", "cartpole", "cartpole-swingup", "acrobot",
-         "acrobot-swingup")  # fmt: skip
+START, END = "<!-- results:start -->", "<!-- results:end -->"
+"""Between these the README has the table."""
 _AIMS = json.loads((Path(__file__).parent / "aims.json").read_text())["tasks"]
 AIMS = {task: float(aim["return"]) for task, aim in _AIMS.items()}
 """Mean returns of version 0.1.0, below which none should fall; the file says of which runs."""
@@ -104,7 +104,7 @@ def page(runs: Sequence[Run]) -> str:
     Raises:
         ValueError: for runs of several configurations, which have no mean in common.
     """
-    found = {task: ours(runs, task) for task in TASKS}
+    found = {task: ours(runs, task) for task in TARGETS}
     if mixed := [task for task, those in found.items() if configurations(those) > 1]:
         raise ValueError(f"{', '.join(mixed)}: expected runs of one configuration, got several.")
     used = [run for those in found.values() for run in those]
@@ -139,7 +139,7 @@ def brief(runs: Sequence[Run]) -> str:
     """What somebody new wants to know first, for README.md."""
     header = ["task", "seeds", "real steps", "return", "chatter", "paper", "paper's steps"]
     rows, used = [], []
-    for task in TASKS:
+    for task in TARGETS:
         if not (those := ours(runs, task)):
             continue
         used += those
@@ -160,7 +160,7 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="where the runs are")
     results = parser.parse_args().results
     runs = read_runs(results, any_version=True).runs
-    if not any(ours(runs, task) for task in TASKS):
+    if not any(ours(runs, task) for task in TARGETS):
         parser.exit(1, f"{results}: expected default runs of seeds from {REPORT_SEED} on.\n")
     text = page(runs)
     (results / "README.md").write_text(text)

@@ -17,7 +17,7 @@ from report.curves import imagined_curves, learning_curves
 from report.generalization import generalization
 from report.main_table import main_table
 from report.over_runs import aggregate_section
-from report.overview import fill_page, origins, overview
+from report.overview import origins, overview
 from report.planned import planned_section, read_planned
 from report.planner_and_actor import acting_section
 from report.results import Results
@@ -46,7 +46,6 @@ class ReportConfig:
         any_version: whether to take runs of other versions of this package.
         reps: resamples of the bootstrap.
         overview: page with PhIHP's tables for every label; ``None`` for none.
-        page: page with the table of returns between its markers; ``None`` for none.
         plugins: Python files or modules to import, which register tasks and methods.
     """
 
@@ -59,7 +58,6 @@ class ReportConfig:
     any_version: bool = False
     reps: int = 2000
     overview: str | None = "results/README.md"
-    page: str | None = None
     plugins: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -136,8 +134,6 @@ def make_report(config: ReportConfig) -> Report:
     if config.overview is not None:
         Path(config.overview).parent.mkdir(parents=True, exist_ok=True)
         Path(config.overview).write_text(overview(folders.runs, every))
-    if config.page is not None and chosen:
-        fill_page(Path(config.page), chosen)
     return Report(tuple(sections), tuple(problems))
 
 

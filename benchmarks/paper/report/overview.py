@@ -10,9 +10,6 @@ from report.planner_and_actor import acting_section, returns_markdown
 from report.runs import Run
 from report.write import section_markdown
 
-START, END = "<!-- results:start -->", "<!-- results:end -->"
-"""Between these a page has the table of returns."""
-
 
 def overview(runs: Sequence[Run], planned: Planned | None = None) -> str:
     """The page, as Markdown."""
@@ -57,17 +54,6 @@ def _episodes(runs: Sequence[Run]) -> str:
     """How many episodes an evaluation had; several numbers if it was not the same everywhere."""
     counts = {len(acting.returns) for run in runs for acting in run.acting.values()}
     return " or ".join(str(count) for count in sorted(counts))
-
-
-def fill_page(page: Path, runs: Sequence[Run]) -> bool:
-    """Put the table of returns between a page's markers; whether it has them.
-
-    Args:
-        page: the page, such as a README.
-        runs: the runs with one label.
-    """
-    used = [run for run in runs if run.method == "phihp"]
-    return put_between(page, START, END, f"{returns_markdown(used)}\n{origins(used)}")
 
 
 def put_between(page: Path, start: str, end: str, text: str) -> bool:

@@ -81,7 +81,6 @@ def make(tmp_path: Path, runs: Path | None = None, **changes) -> Report:
         out=str(tmp_path / "report"),
         reps=50,
         overview=str(tmp_path / "overview.md"),
-        page=str(tmp_path / "page.md"),
     )
     return make_report(replace(config, **changes))
 

@@ -21,7 +21,6 @@ from report import (
 from report.action_times import read_turns
 from report.claims import claims_section
 from report.main_table import main_table
-from report.overview import END, START
 from report.planned import read_planned
 from report.planner_and_actor import acting_section
 from report.results import Results
@@ -155,5 +154,5 @@ def test_the_committed_report_is_that_of_the_committed_runs() -> None:
 
 def test_the_table_of_the_readme_is_that_of_the_committed_runs() -> None:
     found = read_runs(ROOT / "results" / "runs", any_version=True)
-    kept = (ROOT / "README.md").read_text().split(START)[1].split(END)[0]
+    kept = (ROOT / "README.md").read_text().split(six_tasks.START)[1].split(six_tasks.END)[0]
     assert kept.strip() == six_tasks.brief(found.runs).strip(), "run `make report`"

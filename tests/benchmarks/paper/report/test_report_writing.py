@@ -16,10 +16,9 @@ from report import (
     Stat,
     Table,
     Trial,
-    read_runs,
     write_trials,
 )
-from report.overview import END, START, fill_page, overview
+from report.overview import put_between
 from report.sections import Picture, Section
 from report.write import write_report
 
@@ -38,7 +37,6 @@ def test_the_whole_report(tmp_path: Path) -> None:
     trials = [Trial("pendulum", 0, "planning_horizon", h, -180.0 - h, 1.0, 5, h) for h in (1, 4)]
     write_trials(tmp_path / "sensitivity" / "pendulum.json", trials)
     (tmp_path / "sensitivity" / "torn.json").write_text("[{")
-    (tmp_path / "page.md").write_text(f"# Page\n\n{START}\nold\n{END}\n\nThe end.\n")
     made = make(tmp_path)
     (problem,) = made.problems
     assert "torn.json" in problem
@@ -64,10 +62,6 @@ def test_the_whole_report(tmp_path: Path) -> None:
     assert over["TD-MPC"]["mean"] == NOT_RUN
     assert 0 < float(over["dd-CEM"]["IQM"]) < float(over["PhIHP"]["IQM"]) < 1
     assert "## paper" in (tmp_path / "overview.md").read_text()
-    filled = (tmp_path / "page.md").read_text()
-    assert "old" not in filled
-    assert "| pendulum | 2 | 1000 | −185.0 ± 0.0 | −186.5 ± 0.0 |" in filled
-    assert filled.endswith("\n\nThe end.\n")
 
 
 def test_the_same_runs_make_the_same_files(tmp_path: Path) -> None:
@@ -124,11 +118,11 @@ def test_a_table_for_people_and_for_programs() -> None:
 
 
 def test_a_page_without_markers_is_left_alone(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    make_run(tmp_path / "runs")
-    runs = read_runs(tmp_path / "runs").runs
-    assert not fill_page(page, runs)
-    page.write_text(f"{END} {START}")
-    assert not fill_page(page, runs)
-    assert page.read_text() == f"{END} {START}"
-    assert "### Time" in overview(runs)
+    page, (start, end) = tmp_path / "page.md", ("<!-- a -->", "<!-- b -->")
+    assert not put_between(page, start, end, "new")
+    page.write_text(f"{end} {start}")
+    assert not put_between(page, start, end, "new")
+    assert page.read_text() == f"{end} {start}"
+    page.write_text(f"# Page\n\n{start}\nold\n{end}\n\nThe end.\n")
+    assert put_between(page, start, end, "new")
+    assert page.read_text() == f"# Page\n\n{start}\nnew\n{end}\n\nThe end.\n"
