@@ -24,6 +24,7 @@ from phihp_torchrl import Agent, ConfigError
 from phihp_torchrl.baselines import BASELINES, make_baselines
 from phihp_torchrl.deployment import load_agent
 from phihp_torchrl.evaluation import (
+    TARGETS,
     controllers_table,
     evaluate,
     evaluation_seed,
@@ -34,8 +35,6 @@ from phihp_torchrl.origin import describe_origin, origin_text
 from phihp_torchrl.worlds import SimulatedWorld
 
 RESULTS = Path("results/baselines")
-TASKS = ("pendulum", "pendulum-swingup", "cartpole", "cartpole-swingup", "acrobot",
-         "acrobot-swingup")  # fmt: skip
 LEARNED = ("planner", "actor")
 """The two ways in which an agent acts."""
 _CALLS = 100
@@ -100,7 +99,7 @@ def main(words: Sequence[str] | None = None) -> None:
     """Measure what has not been measured."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--agents", type=Path, default=Path("results/agents"))
-    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
+    parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
     parser.add_argument("--baselines", nargs="+", choices=list(BASELINES), default=list(BASELINES))
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--slow-episodes", type=int, default=10, help="of those that plan")
