@@ -67,6 +67,7 @@ THREE_128 = widths([128, 128], [128, 128, 128], 1e-3, 2e-3)
 
 VARIANTS: dict[str, Variant] = {
     "default": Variant(),
+    "wide": Variant(widths([300, 300], [200, 200, 200], 3e-4, 1e-3)),
     "2x64": Variant(widths([64, 64], [64, 64], 1e-3, 2e-3)),
     "3x64": Variant(widths([64, 64], [64, 64, 64], 1e-3, 2e-3)),
     "2x96": Variant(widths([96, 96], [96, 96], 1e-3, 2e-3)),

@@ -11,6 +11,7 @@ from statistics import median
 import numpy as np
 from scipy import stats
 
+from report.paper_systems import TD_MPC, PaperSystem
 from report.results import TASKS
 from report.verdicts import NOT_SHOWN, REFUTED, SHOWN, Finding
 
@@ -28,6 +29,18 @@ def read_turns(directory: Path) -> Turns:
     """Those that are kept in a directory; none where there is no such directory."""
     paths = sorted(directory.glob("*.json"))
     return {path.stem: json.loads(path.read_text())["turns"] for path in paths}
+
+
+def acting_time(turns: Turns, system: PaperSystem, task: str) -> float | None:
+    """Milliseconds for an action of a system as it is used: compiled where it plans.
+
+    TD-MPC's are those of the reduced width, which its runs here have.
+    """
+    name = f"{system.name}, {WIDTHS[1]}" if system == TD_MPC else system.name
+    for mode in reversed(MODES):
+        if found := turns.get(task, {}).get(f"{name}, {mode}"):
+            return median(found)
+    return None
 
 
 def faster(turns: Turns) -> list[Finding]:

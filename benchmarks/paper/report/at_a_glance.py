@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from measures import Between, mean_between
 from phihp_torchrl.evaluation import PUBLISHED
+from report.action_times import Turns, acting_time
 from report.bounds import normalise
 from report.efficiency import sample_efficiency
 from report.paper_systems import PaperSystem, systems
@@ -30,21 +31,27 @@ class _Compromise:
     milliseconds: float | None
 
 
-def at_a_glance(results: Results) -> Section:
-    """A figure with a point for each system, and a table of its numbers."""
+def at_a_glance(results: Results, turns: Turns | None = None) -> Section:
+    """A figure with a point for each system, and a table of its numbers.
+
+    Args:
+        results: the scores.
+        turns: times of an action (:func:`~report.action_times.read_turns`).
+    """
     figure = Figure(figsize=(9.0, 3.8), layout="constrained")
     samples_axis, time_axis = figure.subplots(1, 2, sharey=True)
     header = ["system", "normalised return", "real samples to 90 %", "ms for an action"]
     header += [f"{name}, published" for name in header[1:]]
     rows: list[list[TableCell]] = []
     for i, system in enumerate(systems("ours", "baseline")):
-        ours, theirs = _measured(results, system), _published(system)
+        ours, theirs = _measured(results, turns or {}, system), _published(system)
         rows.append([system.name, *_cells(ours, NOT_RUN), *_cells(theirs, "–")])
         for found, filled in ((ours, True), (theirs, False)):
             if found is not None:
                 name = system.name if filled else f"{system.name}, published"
                 _draw((samples_axis, time_axis), found, f"C{i}", name, filled=filled)
     samples_axis.set_xscale("symlog", linthresh=1000)
+    samples_axis.set_xticks([0, 1_000, 10_000, 100_000])
     time_axis.set_xscale("log")
     samples_axis.set(xlabel="real samples to 90 %", ylabel="normalised return")
     time_axis.set(xlabel="ms for an action")
@@ -56,8 +63,9 @@ def at_a_glance(results: Results) -> Section:
         "At a glance",
         "Means over the six tasks, of a system that was run on all of them: of returns between "
         "bounds (`docs/evaluation.md`), of what the real samples to 90 % lie between, and of the "
-        "time of an action. *Published*: the same from the paper's numbers, with its own "
-        "CartPoleSwingup and on an Apple M1; nothing where it has none.",
+        "time of an action, of compiled plans (`results/latency`). *Published*: the same from the "
+        "paper's numbers, with its own CartPoleSwingup and on an Apple M1; nothing where it has "
+        "none.",
         {"Over the six tasks": Table("at_a_glance", header, rows)},
         [
             Picture(
@@ -69,20 +77,18 @@ def at_a_glance(results: Results) -> Section:
     )
 
 
-def _measured(results: Results, system: PaperSystem) -> _Compromise | None:
+def _measured(results: Results, turns: Turns, system: PaperSystem) -> _Compromise | None:
     """``None`` unless the system was run on all six tasks."""
     scores = [results.usual(system, task) for task in SIX_TASKS]
     if not all(scores):
         return None
-    times = [
-        [score.milliseconds for score in of_task if score.milliseconds is not None]
-        for of_task in scores
-    ]
+    times = [acting_time(turns, system, task) for task in SIX_TASKS]
+    known = [time for time in times if time is not None]
     samples = [sample_efficiency(results, system, task) for task in SIX_TASKS]
     return _Compromise(
         fmean(fmean(score.normalised for score in of_task) for of_task in scores),
         mean_between([between for between in samples if between is not None]),
-        fmean(map(fmean, times)) if all(times) else None,
+        fmean(known) if len(known) == len(SIX_TASKS) else None,
     )
 
 

@@ -105,7 +105,7 @@ def make_report(config: ReportConfig) -> Report:
     results = Results(chosen, planned)
     sections = [
         _make("The paper's claims", lambda: claims_section(results, turns), problems),
-        _make("At a glance", lambda: at_a_glance(results), problems),
+        _make("At a glance", lambda: at_a_glance(results, turns), problems),
         _make("Planned and done", lambda: planned_section(planned, chosen), problems),
         _make("Soundness", lambda: soundness(chosen), problems),
         _make("Main table", lambda: main_table(results), problems),

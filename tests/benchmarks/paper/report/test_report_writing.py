@@ -61,6 +61,13 @@ def test_the_whole_report(tmp_path: Path) -> None:
     over = {row["system"]: row for row in table(tmp_path, "aggregates_over_tasks")}
     assert over["TD-MPC"]["mean"] == NOT_RUN
     assert 0 < float(over["dd-CEM"]["IQM"]) < float(over["PhIHP"]["IQM"]) < 1
+    glance = {row["system"]: row for row in table(tmp_path, "at_a_glance")}
+    assert glance["PhIHP"]["real samples to 90 %"] == "≤ 1000"
+    assert float(glance["PhIHP"]["normalised return"]) == pytest.approx(
+        float(over["PhIHP"]["mean"])
+    )
+    assert glance["PhIHP"]["ms for an action"] == glance["TD3"]["normalised return"] == NOT_RUN
+    assert float(glance["TD3"]["real samples to 90 %, published"]) == pytest.approx(168_500)
     assert "## paper" in (tmp_path / "overview.md").read_text()
 
 
