@@ -46,6 +46,7 @@ class GridConfig:
         proof: whether the episodes are those kept for the last proof, which each cell may play
             once. The code must be that of one commit, and the training seed one for reports.
         retry_failed: whether to try cells again that ended with an error.
+        only_plan: whether to note the cell as planned and leave it at that.
         runs: directory of the runs in full.
         results: directory of what is kept of finished runs.
         claim_wait: seconds to wait for a cell that another process holds, as one that was killed
@@ -68,6 +69,7 @@ class GridConfig:
     allow_dirty: bool = False
     proof: bool = False
     retry_failed: bool = False
+    only_plan: bool = False
     runs: str = "outputs/grid"
     results: str = "results/runs"
     claim_wait: float = 10.0

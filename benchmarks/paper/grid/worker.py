@@ -39,7 +39,8 @@ def work(config: GridConfig, root: Path) -> CellState:
         root: directory that relative ones are in.
 
     Returns:
-        Its state. An error of the run is a state too: it ends this cell, not the grid.
+        Its state, with ``only_plan`` as it is found. An error of the run is a state too: it ends
+        this cell, not the grid.
 
     Raises:
         ConfigError: if the code is not that of a commit, unless ``allow_dirty``; if the cell is
@@ -50,6 +51,8 @@ def work(config: GridConfig, root: Path) -> CellState:
     if not config.allow_dirty:
         check_committed()
     files = config.files(root)
+    if config.only_plan:
+        return look(files)
     if not (is_done(files) and is_whole(files)):
         with claim(files.lock, config.claim_wait) as ours:
             # Only now: another process may have finished the cell, or failed at it, meanwhile.

@@ -59,6 +59,17 @@ def test_the_script_runs_a_grid_shows_it_and_skips_it(
     assert (planned.parent / "cartpole-default-n2500-seed0" / "failure.json").is_file()
 
 
+def test_a_grid_may_be_planned_before_it_is_run(
+    run_script: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_script("run_grid", "seed=4,5", "only_plan=true", "refresh=0", "allow_dirty=true")
+    assert "2 cells: 2 waiting" in capsys.readouterr().out
+    planned = json.loads((tmp_path / "results" / "runs" / "planned.json").read_text())
+    assert [cell["seed"] for cell in planned.values()] == [4, 5]
+    assert not list((tmp_path / "results" / "runs").glob("*/"))
+    assert not list((tmp_path / "outputs").rglob("config.yaml"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
