@@ -1,6 +1,6 @@
 """Run the last proof, stage by stage: what the claims need most comes first.
 
-    python benchmarks/paper/proof.py only_plan=true         # note all cells in planned.json, run none
+    python benchmarks/paper/proof.py only_plan=true    # notes all cells in planned.json, runs none
     python benchmarks/paper/proof.py
     python benchmarks/paper/proof.py --stages cem td3 launcher=joblib jobs=2
 
