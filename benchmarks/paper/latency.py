@@ -97,6 +97,7 @@ def measure(task: str, *, compiled: bool) -> dict[str, Any]:
     return {
         "milliseconds": {name: median(of) for name, of in times.items()},
         "turns": times,
+        "search": load_config(task)["planner"],  # of PhIHP by default, by which a test sees its age
         "origin": describe_origin(0),
     }
 

@@ -2,17 +2,22 @@
 
     python benchmarks/paper/proof.py only_plan=true    # notes all cells in planned.json, runs none
     python benchmarks/paper/proof.py
-    python benchmarks/paper/proof.py --stages cem td3 launcher=joblib jobs=2
+    python benchmarks/paper/proof.py cem td3 launcher=joblib jobs=2
+    git worktree add ../frozen frozen && python benchmarks/paper/proof.py clone=../frozen
 
 Each stage is a grid (``run_grid.py``) with ``proof=true``, and words that are given here are given
-to all of them. A command that was cut off goes on where it was, and several may run at once. Times
-of an action are no grid: ``latency.py``. Whatever is finished stands, and a report says of each
-cell that was planned whether it is done.
+to all of them. A command that was cut off goes on where it was, and several may run at once; with
+Ctrl-C each stage ends by itself. Times of an action are no grid: ``latency.py``. Whatever is
+finished stands, and a report says of each cell that was planned whether it is done.
+
+All of a proof is the work of one commit. ``clone`` is the folder of a clone whose code makes the
+cells, where this file is of a later commit; they are kept in this one's results/runs, or where
+``results`` says.
 """
 
 from __future__ import annotations
 
-import argparse
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +30,7 @@ PAPER = 'overrides=["preset=paper","evaluate.video=false"]'
 STAGES = {
     "phihp": [SIX, TEN],
     "cem": [SIX, FIVE, "method=cem-oracle,ph-cem,dd-cem"],
+    "twin": [SIX, FIVE, "method=dd-phihp"],
     "tenth": [SIX, FIVE, "method=phihp,dd-phihp", "share=0.1"],
     "few": [SIX, FIVE, "method=phihp,dd-phihp", "share=0.02,0.05,0.01"],
     "all": [SIX, FIVE, "method=phihp,dd-phihp", "share=1"],
@@ -50,20 +56,25 @@ are about a quarter of the published ones, which take a quarter of a second for 
 
 
 def main() -> None:
-    """Run the stages that are asked for, or all; stop at the first that fails."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--stages", nargs="+", metavar="STAGE", choices=STAGES, default=[*STAGES])
-    options, words = parser.parse_known_args()
-    script = str(Path(__file__).with_name("run_grid.py"))
-    # A grid says itself what is wrong with its words.
-    wrong = [word for word in words if "=" not in word]
-    if wrong:
-        parser.error(f"expected a stage of {[*STAGES]} or a setting, got {wrong[0]!r}.")
-    for stage in options.stages:
+    """Run the stages that are asked for, or all; a stage with a cell that failed stops no other."""
+    stages = [word for word in sys.argv[1:] if "=" not in word]
+    given = dict(word.split("=", 1) for word in sys.argv[1:] if "=" in word)
+    clone = Path(given.pop("clone", ".")).absolute()
+    given.setdefault("results", str(Path("results/runs").absolute()))
+    settings = [f"{key}={value}" for key, value in given.items()]
+    for stage in stages:
+        if stage not in STAGES:
+            sys.exit(f"error: expected stages of {[*STAGES]} and settings, got {stage!r}.")
+    script = str(clone / "benchmarks" / "paper" / "run_grid.py")
+    environment = {**os.environ, "PYTHONPATH": str(clone)}
+    failed = []
+    for stage in stages or STAGES:
         print(f"stage {stage}", flush=True)
-        code = subprocess.call([sys.executable, script, "proof=true", *STAGES[stage], *words])
-        if code:
-            sys.exit(code)
+        words = [sys.executable, script, "proof=true", *STAGES[stage], *settings]
+        if subprocess.call(words, cwd=clone, env=environment):
+            failed.append(stage)
+    if failed:
+        sys.exit(f"Not all cells are done of the stages {', '.join(failed)}.")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 
-from measures import agent_in, paired_difference_of_seeds
+from measures import DEFAULT_SAMPLES, agent_in, paired_difference_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, TARGETS, markdown_table
 from report.cells import configurations
 from report.overview import origins, put_between
@@ -35,8 +35,9 @@ AIMS = {task: float(aim["return"]) for task, aim in _AIMS.items()}
 
 
 def ours(runs: Sequence[Run], task: str) -> list[Run]:
-    """The default runs of a task with reporting seeds."""
-    kept = [run for run in runs if (run.method, run.label, run.task) == ("phihp", "default", task)]
+    """The default runs of a task with reporting seeds and the default number of real samples."""
+    wanted = ("phihp", "default", task, DEFAULT_SAMPLES[task])
+    kept = [run for run in runs if (run.method, run.label, run.task, run.samples) == wanted]
     return sorted((run for run in kept if run.seed >= REPORT_SEED), key=lambda run: run.seed)
 
 

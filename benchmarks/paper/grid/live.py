@@ -63,6 +63,8 @@ class LiveTable(Callback):
         else:
             self._over.set()
             self._thread.join()
+        if config.only_plan:
+            return
         if failed := failures(self._states):
             _write([*failed, "Try them again with retry_failed=true."])
             sys.exit(1)

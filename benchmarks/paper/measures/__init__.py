@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from measures.acting import agent_in
-from measures.censored import Between, mean_between, ratio_between, ratio_interval
+from measures.censored import RESAMPLES, Between, mean_between, ratio_between, ratio_interval
 from measures.configuration import configuration_hash
 from measures.curve import CurvePoint, curve_from_metrics, read_curve, write_curve
 from measures.differences import (
@@ -31,6 +31,7 @@ __all__ = [
     "PREDICTION_STEPS",
     "PUBLISHED_SAMPLES",
     "PUBLISHED_UPDATES",
+    "RESAMPLES",
     "Between",
     "CurvePoint",
     "Difference",

@@ -91,8 +91,8 @@ def make_report(config: ReportConfig) -> Report:
     import_plugins(config.plugins)
     folders = read_runs(Path(config.runs), any_version=config.any_version)
     trials, unread = read_trials(Path(config.sensitivity))
-    turns = read_turns(Path(config.latency))
-    problems = [*folders.problems, *unread]
+    turns, untimed = read_turns(Path(config.latency))
+    problems = [*folders.problems, *unread, *untimed]
     if not folders.runs and any(path.is_dir() for path in Path(config.runs).glob("*")):
         raise ConfigError(
             "runs",
@@ -106,7 +106,7 @@ def make_report(config: ReportConfig) -> Report:
     sections = [
         _make("The paper's claims", lambda: claims_section(results, turns), problems),
         _make("At a glance", lambda: at_a_glance(results, turns), problems),
-        _make("Planned and done", lambda: planned_section(planned, chosen), problems),
+        _make("Planned and done", lambda: planned_section(every, folders.runs), problems),
         _make("Soundness", lambda: soundness(chosen), problems),
         _make("Main table", lambda: main_table(results), problems),
         _make("Learning curves", lambda: learning_curves(results), problems),

@@ -1,4 +1,4 @@
-"""The paper's claims, each judged: shown, not shown or refuted, with effect, interval and n."""
+"""The paper's claims: what is compared for each, and the sentence that a careful reader writes."""
 
 from __future__ import annotations
 
@@ -30,10 +30,9 @@ from report.paper_systems import (
 from report.planner_and_actor import planning_gain, usual_groups
 from report.results import TASKS, Results, Score, well_filled
 from report.sections import Section
-from report.tables import Table, TableCell
+from report.tables import NOT_RUN, Table, TableCell
 from report.verdicts import (
     NOT_MEASURED,
-    NOT_RUN,
     NOT_SHOWN,
     REFUTED,
     SHOWN,
@@ -45,6 +44,11 @@ from report.verdicts import (
 
 FEWER = 5.0
 """The claim is of 5 to 15 times fewer samples."""
+
+REDUCED = (
+    "TD-MPC is of a reduced width here: its networks and candidates are about a quarter of the "
+    "published ones."
+)
 
 _PAIRS = (
     (PHIHP, DD_PHIHP),
@@ -82,17 +86,20 @@ def claims_section(results: Results, turns: Turns | None = None) -> Section:
         [(PHIHP, baseline) for baseline in systems("baseline")],
     )
     lines = [
-        f"- **{claim}**: {sentence(findings, done=_any_done(results, systems))}"
-        for (claim, findings), systems in zip(claims.items(), sides, strict=True)
+        f"- **{claim}**: {sentence(findings, done=_any_done(results, pairs))}"
+        for (claim, findings), pairs in zip(claims.items(), sides, strict=True)
     ]
     if published := _published_samples(results):
         lines.append(f"- {published}")
+    if any(results.has_run(TD_MPC, task) for task in TASKS):
+        lines.append(f"- {REDUCED}")
     rows: list[list[TableCell]] = [
         [f"{i}, {f.what}", f.verdict, f.effect, f.ends, f.interval, f.seeds]
         for i, findings in enumerate(claims.values(), 1)
         for f in findings
     ]
-    header = ["claim, comparison", "verdict", "effect", "lies between", "95 % interval", "seeds"]
+    header = ["claim, comparison", "verdict", "effect", "lies between", "95 % interval"]
+    header += ["seeds or turns"]
     return Section(
         "The paper's claims", "\n".join(lines), {"Comparisons": Table("claims", header, rows)}
     )
@@ -122,10 +129,10 @@ def sentence(findings: Sequence[Finding], *, done: bool = False) -> str:
     return f"{', '.join(parts)} of {total} comparisons{f' ({named})' if named else ''}."
 
 
-def _any_done(results: Results, systems: Iterable[Sequence[PaperSystem]]) -> bool:
+def _any_done(results: Results, pairs: Iterable[Sequence[PaperSystem]]) -> bool:
     """Whether all sides of any of these comparisons have a run on a task."""
     return any(
-        all(results.has_run(one, task) for one in sides) for sides in systems for task in TASKS
+        all(results.has_run(one, task) for one in sides) for sides in pairs for task in TASKS
     )
 
 
@@ -211,19 +218,18 @@ def not_worse(results: Results) -> list[Finding]:
 
 def _absent(
     results: Results,
-    systems: tuple[PaperSystem, PaperSystem],
+    both: tuple[PaperSystem, PaperSystem],
     task: str,
     scores: Sequence[Sequence[Score]],
 ) -> Finding:
-    """That of a comparison that was planned, of which a side has no run or no number."""
-    runs = [{score.run.seed for score in side} for side in scores]
-    seeds = _seeds(results, systems, task, runs, *map(_samples, scores))
-    return Finding(task, NOT_MEASURED if all(runs) else NOT_RUN, "–", "–", "–", seeds)
+    """That of a comparison that was planned, of which a side has no run."""
+    seeds = _seeds(results, both, task, scores, *map(_samples, scores))
+    return Finding(task, NOT_RUN, "–", "–", "–", seeds)
 
 
 def _seeds(
     results: Results,
-    systems: tuple[PaperSystem, PaperSystem],
+    both: tuple[PaperSystem, PaperSystem],
     task: str,
     values: Sequence[Collection[object]],
     *samples: Collection[int],
@@ -232,14 +238,14 @@ def _seeds(
 
     Args:
         results: with the plan.
-        systems: the two sides.
+        both: the two sides.
         task: name of the task.
         values: one for each seed, by side.
         samples: the numbers of real samples that are compared, by side.
     """
     planned = (
         results.planned.seeds(system, task, numbers)
-        for system, numbers in zip(systems, samples, strict=True)
+        for system, numbers in zip(both, samples, strict=True)
     )
     return ", ".join(_of_planned(len(side), n) for side, n in zip(values, planned, strict=True))
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from measures import Between, mean_between
 from report.paper_systems import PaperSystem
-from report.results import Results, Score
+from report.results import Results, Score, well_filled
 from report.tables import Ends
 
 SHARE = 0.9
@@ -65,9 +65,18 @@ def samples_to_90(points: Sequence[tuple[int, float]]) -> Between:
 def efficiency_of_seeds(results: Results, system: PaperSystem, task: str) -> list[Between]:
     """What the samples of each seed lie between, by seed.
 
-    A seed with few runs has wide ends, and makes those of the mean wide: none is left out.
+    Those seeds count that were run at every number of samples of which there are enough seeds: one
+    that was run at the most alone would have wide ends, which say how it was planned and not how
+    soon it learns. Where there is no such seed all count.
     """
-    return [samples_to_90(p) for p in points_by_seed(results.scores(system, task)).values()]
+    scores = results.scores(system, task)
+    usual = well_filled(score.run.samples for score in scores)
+    numbers: dict[int, set[int]] = defaultdict(set)
+    for score in scores:
+        numbers[score.run.seed].add(score.run.samples)
+    whole = {seed for seed, found in numbers.items() if usual <= found} or {*numbers}
+    points = points_by_seed([score for score in scores if score.run.seed in whole])
+    return [samples_to_90(of_seed) for of_seed in points.values()]
 
 
 def sample_efficiency(results: Results, system: PaperSystem, task: str) -> Between | None:

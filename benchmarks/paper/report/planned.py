@@ -108,21 +108,22 @@ def read_planned(directory: Path) -> Planned:
 
 
 def planned_section(planned: Planned, runs: Sequence[Run]) -> Section:
-    """A row for each method and task: the cells that are done, of those that were planned."""
+    """A row for each method, task and label: the cells that are done, of those planned."""
     done = {run.folder.name: run for run in runs}
-    groups: dict[tuple[str, str, int], list[Cell]] = defaultdict(list)
+    groups: dict[tuple[str, str, int, str], list[Cell]] = defaultdict(list)
     for cell in planned.cells:
-        groups[cell.task, cell.method, cell.samples or 0].append(cell)
+        groups[cell.task, cell.method, cell.samples or 0, cell.label].append(cell)
     rows: list[list[TableCell]] = []
-    for (task, method, samples), cells in sorted(groups.items()):
+    for (task, method, samples, label), cells in sorted(groups.items()):
         made = [done[cell.name] for cell in cells if cell.name in done]
         absent = [cell.name for cell in cells if cell.name not in done]
         name = f"{task}, {method}" + (f", {samples}" if samples else "")
+        name += f" ({label})" if label != "default" else ""
         rows.append([name, _count(planned, len(made), absent), Number(_core_hours(made))])
     here = sum(cell.name in done for cell in planned.cells)
     hours = Number(_core_hours(runs))
     text = (
-        f"{here} of {len(planned.cells)} planned cells are done."
+        f"{here} of {len(planned.cells)} planned cells are done, of all labels."
         if rows
         else "No plan: there is no `planned.json`, so that nobody sees which cells are missing."
     )

@@ -11,12 +11,12 @@ from measures import FEWEST_SEEDS, Between, Difference, holm, ratio_interval
 from report.bounds import margin
 from report.cells import MIXED, is_mixed
 from report.results import Score
+from report.tables import NOT_RUN
 
 LEVEL = 0.05
 """Below this p-value, adjusted by Holm, a difference counts as significant."""
 
-SHOWN, NOT_SHOWN, REFUTED = "shown", "not shown", "refuted"
-NOT_RUN, NOT_MEASURED = "not run", "not measured"
+SHOWN, NOT_SHOWN, REFUTED, NOT_MEASURED = "shown", "not shown", "refuted", "not measured"
 
 
 class Pair(NamedTuple):
@@ -48,13 +48,14 @@ class Finding:
     Args:
         what: the task, or the systems and the task.
         verdict: :data:`SHOWN`, :data:`NOT_SHOWN` or :data:`REFUTED`, or
-            :data:`~report.cells.MIXED` where runs are compared that cannot be, or :data:`NOT_RUN`
-            where a side was planned and has no run, or :data:`NOT_MEASURED` where both have runs
-            and those of a side do not say what is compared.
+            :data:`~report.cells.MIXED` where runs are compared that cannot be, or
+            :data:`~report.tables.NOT_RUN` where a side was planned and has no run, or
+            :data:`NOT_MEASURED` where there are runs that do not say what is compared.
         effect: its size, in words.
         ends: what the effect lies between, where it is known by its ends alone.
-        interval: its 95 % interval over training seeds.
-        seeds: number of training seeds on either side, and of how many where more were planned.
+        interval: its 95 % interval over training seeds, or over turns.
+        seeds: number of training seeds on either side, and of how many where more were planned;
+            or of turns.
     """
 
     what: str
@@ -78,6 +79,8 @@ def of_differences(pairs: Sequence[Pair]) -> list[Finding]:
             continue
         verdict = _verdict(gap, p, pair.least)
         effect = _text(gap.mean, "+") + ("" if math.isnan(p) else f", p = {p:.2g}")
+        if pair.least and not math.isnan(p):
+            effect += f" of {_text(pair.least)}"
         within = margin(pair.task)
         if verdict == NOT_SHOWN and within is not None and gap.within(within):
             effect += ", equivalent"

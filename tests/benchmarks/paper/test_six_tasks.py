@@ -20,6 +20,7 @@ def test_reporting_seeds_of_the_default_alone_count(tmp_path):
         make_run(tmp_path, seed=seed)
     make_run(tmp_path, seed=104, label="wide")
     make_run(tmp_path, seed=105, method="td3-im-ph")
+    make_run(tmp_path, seed=106, samples=200)
     found = read_runs(tmp_path).runs
     assert [run.seed for run in six_tasks.ours(found, "pendulum")] == [100, 103]
     assert six_tasks.ours(found, "acrobot") == []

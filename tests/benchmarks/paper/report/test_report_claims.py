@@ -59,9 +59,9 @@ def test_each_claim_gets_its_verdict(tmp_path: Path) -> None:
     ]
     assert rows["5, TD-MPC, published, eager on pendulum"] == [
         "shown",
-        "4.0 ms against 44.0, 10.0 times",
+        "4.0 ms against 44.0, 10.00 times",
         "–",
-        "10.0 to 11.0 times",
+        "10.00 to 11.00 times",
         "3 turns",
     ]
     assert rows["4, Ph-CEM on pendulum, 500 samples"][2:] == ["–", "−0.1 to 0.3", "3, 3"]
@@ -176,8 +176,16 @@ def test_a_cell_of_several_configurations_gets_no_verdict(tmp_path: Path) -> Non
 def test_times_are_compared_by_turns(tmp_path: Path, theirs: list[float], verdict: str) -> None:
     turns = {"PhIHP, compiled": [4.0] * 4, "TD-MPC, reduced, compiled": theirs}
     (tmp_path / "acrobot.json").write_text(json.dumps({"turns": turns}))
-    (finding,) = faster(read_turns(tmp_path))
+    (finding,) = faster(read_turns(tmp_path)[0])
     assert (finding.what, finding.verdict) == ("TD-MPC, reduced, compiled on acrobot", verdict)
+
+
+def test_a_p_value_of_a_margin_says_so(tmp_path: Path) -> None:
+    for seed, way in enumerate((-0.1, 0.0, 0.1)):
+        make_run(tmp_path, seed=seed, acting={"planner": [way], "actor": [way]})
+        make_run(tmp_path, "td3", seed=seed, samples=300, acting={"actor": [-2 * way]})
+    (finding,) = not_worse(results(tmp_path))
+    assert finding.effect.endswith(" of −19.7")  # 1 % of 200 π²
 
 
 @pytest.mark.parametrize(

@@ -291,3 +291,14 @@ def test_learning_curve(tmp_path: Path) -> None:
     assert wide.axes[0].get_xscale() == "symlog"
     for i, drawn in enumerate((figure, wide, learning_curve({}))):
         drawn.savefig(tmp_path / f"{i}.png")
+
+
+def test_seeds_that_were_run_at_fewer_numbers_do_not_widen_the_samples(tmp_path: Path) -> None:
+    """Three seeds have a point at 100 samples; the fourth was run at 1000 alone."""
+    for seed in (0, 1, 2, 3):
+        make_run(tmp_path, seed=seed, samples=1000, acting={"planner": [-100.0]})
+    alone = sample_efficiency(results(tmp_path), system("phihp"), "pendulum")
+    for seed in (0, 1, 2):
+        make_run(tmp_path, seed=seed, samples=100, acting={"planner": [-101.0]})
+        found = sample_efficiency(results(tmp_path), system("phihp"), "pendulum")
+    assert (str(alone), str(found)) == ("≤ 1000", "≤ 100")

@@ -59,10 +59,11 @@ def test_cells_that_failed_or_are_missing_are_counted_with_their_reason(tmp_path
     assert {name: row["done of planned"] for name, row in found.items()} == {
         "pendulum, phihp, 1000": "7 of 10; 2 failed: ValueError: a / b, 1 missing",
         "pendulum, td3, 1000": "0 of 2; 2 missing",
+        "acrobot, phihp, 5 (other)": "0 of 1; 1 missing",
     }
     hours = float(found["pendulum, phihp, 1000"]["core-hours"])
     assert hours == pytest.approx(7 * 31.0 / 3600)  # one thread
-    assert text(made, "Planned and done").startswith("7 of 12 planned cells are done. All runs")
+    assert text(made, "Planned and done").startswith("7 of 13 planned cells are done")
     assert sum("the run failed: ValueError: a | b" in problem for problem in made.problems) == 2
     assert rows(runs)["3, pendulum"][-1] == "7 of 10, 7 of 10"
 

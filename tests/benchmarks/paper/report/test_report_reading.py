@@ -11,7 +11,9 @@ from grid_cells import ROOT
 from kept_runs import VERSION, make, make_run, table, text
 
 import six_tasks
+from phihp_torchrl import load_config
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.evaluation import TARGETS
 from report import (
     NOT_RUN,
     build,
@@ -142,7 +144,7 @@ def test_the_committed_report_is_that_of_the_committed_runs() -> None:
     results = Results(chosen, read_planned(place).of("default"))
     sections = (
         main_table(results),
-        claims_section(results, read_turns(ROOT / "results" / "latency")),
+        claims_section(results, read_turns(ROOT / "results" / "latency")[0]),
         acting_section(results.runs, results.planned),
     )
     for section in sections:
@@ -156,3 +158,9 @@ def test_the_table_of_the_readme_is_that_of_the_committed_runs() -> None:
     found = read_runs(ROOT / "results" / "runs", any_version=True)
     kept = (ROOT / "README.md").read_text().split(six_tasks.START)[1].split(six_tasks.END)[0]
     assert kept.strip() == six_tasks.brief(found.runs).strip(), "run `make report`"
+
+
+@pytest.mark.parametrize("task", TARGETS)
+def test_the_committed_times_of_an_action_are_of_the_default_search(task: str) -> None:
+    kept = json.loads((ROOT / "results" / "latency" / f"{task}.json").read_text())
+    assert kept["search"] == load_config(task)["planner"], "run benchmarks/paper/latency.py"

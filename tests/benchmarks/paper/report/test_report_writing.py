@@ -37,9 +37,11 @@ def test_the_whole_report(tmp_path: Path) -> None:
     trials = [Trial("pendulum", 0, "planning_horizon", h, -180.0 - h, 1.0, 5, h) for h in (1, 4)]
     write_trials(tmp_path / "sensitivity" / "pendulum.json", trials)
     (tmp_path / "sensitivity" / "torn.json").write_text("[{")
+    (tmp_path / "latency").mkdir()
+    (tmp_path / "latency" / "acrobot.json").write_text("{")
     made = make(tmp_path)
-    (problem,) = made.problems
-    assert "torn.json" in problem
+    assert ["torn.json" in made.problems[0], "acrobot.json" in made.problems[1]] == [True, True]
+    assert len(made.problems) == 2
 
     page = (tmp_path / "report" / "README.md").read_text()
     for section in made.sections:
