@@ -45,6 +45,9 @@ from report.verdicts import (
 FEWER = 5.0
 """The claim is of 5 to 15 times fewer samples."""
 
+_MOST_NAMES = 6
+"""A sentence names no more comparisons of one verdict; the table has all."""
+
 REDUCED = (
     "TD-MPC is of a reduced width here: its networks and candidates are about a quarter of the "
     "published ones."
@@ -124,7 +127,7 @@ def sentence(findings: Sequence[Finding], *, done: bool = False) -> str:
     named = "; ".join(
         f"{verdict}: {', '.join(f.what for f in findings if f.verdict == verdict)}"
         for verdict in (SHOWN, REFUTED, MIXED, NOT_RUN, NOT_MEASURED)
-        if counts[verdict]
+        if 0 < counts[verdict] <= _MOST_NAMES
     )
     return f"{', '.join(parts)} of {total} comparisons{f' ({named})' if named else ''}."
 
