@@ -92,7 +92,9 @@ def write_table(results: Path) -> None:
                 )
     header = ["task, seed", "search", "imagined return", "gain ± s.e.", "CPU time, of preset's"]
     origins = "; ".join(sorted({origin_text(run["origin"]) for run in runs}))
-    said = "; ".join(f"{name}: `{' '.join(changes)}`" for name, changes in SEARCHES.items())
+    said = "; ".join(
+        f"{name}: `{' '.join(changes)}`" for name, changes in SEARCHES.items() if changes
+    )
     (results / "README.md").write_text(
         "# Searches\n\nMade by `python benchmarks/paper/searches.py`. Do not edit. Imagined "
         f"returns of plans in {EPISODES} paired episodes, with the actor and the critics of one "
