@@ -68,6 +68,7 @@ OURS = {
     "num_kept_elites": 0,
     "compare_with_actor": True,
     "warm_start": True,
+    "keep_incumbent": False,
 }
 
 
