@@ -40,7 +40,7 @@ def test_default_runs_are_found_and_others_are_not(tmp_path):
 
 
 def test_hardly_a_kept_run_would_lose_by_the_default(tmp_path):
-    """Of the proof's sixty one would, an Acrobot's actor, by this replay; the run itself went on."""
+    """One of the proof's sixty would, by this replay; the run itself went on."""
     main(["--results", str(tmp_path)])
     table = (tmp_path / "README.md").read_text().splitlines()
     published = (RESULTS / "README.md").read_text().splitlines()
