@@ -12,16 +12,16 @@ results/refits/{task}-seed{seed}.json and README.md.
 
 from __future__ import annotations
 
-import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from measures import paired_difference, study, train
-from phihp_torchrl.evaluation import TARGETS, markdown_table
-from phihp_torchrl.origin import describe_origin, origin_text
+from phihp_torchrl.evaluation import markdown_table
+from phihp_torchrl.origin import origin_text
 from phihp_torchrl.trainers import PolicyTrainer
 
 RESULTS = Path("results/refits")
@@ -48,40 +48,35 @@ def measure(task: str, seed: int) -> dict[str, Any]:
     trained = train(task, seed, [FIT], LastFit)
     trainer = trained.trainer
     return {
-        "task": task,
-        "seed": seed,
         "returns": {
             "before": trained.plan(EPISODES, qvalue=trainer.unfitted),
             "fitted": trained.plan(EPISODES),
         },
         "seconds_of_fits": trainer.seconds_of_fits,
         "seconds": trained.seconds,
-        "origin": describe_origin(seed),
     }
 
 
-def write_table(results: Path) -> None:
+def page(runs: Sequence[dict[str, Any]]) -> str:
     """A row for each task and seed."""
-    runs = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
     rows = []
-    for task in TARGETS:
-        for run in (run for run in runs if run["task"] == task):
-            before, fitted = run["returns"]["before"], run["returns"]["fitted"]
-            gain = paired_difference(torch.tensor(fitted), torch.tensor(before))
-            share = run["seconds_of_fits"] / run["seconds"]
-            rows.append(
-                [
-                    f"{task}, {run['seed']}",
-                    f"{sum(before) / len(before):.1f}",
-                    f"{sum(fitted) / len(fitted):.1f}",
-                    f"{gain.mean:+.2f} ± {gain.standard_error:.2f}",
-                    f"{run['seconds_of_fits']:.1f}",
-                    f"{share:.0%}",
-                ]
-            )
+    for run in runs:
+        before, fitted = run["returns"]["before"], run["returns"]["fitted"]
+        gain = paired_difference(torch.tensor(fitted), torch.tensor(before))
+        share = run["seconds_of_fits"] / run["seconds"]
+        rows.append(
+            [
+                f"{run['task']}, {run['seed']}",
+                f"{sum(before) / len(before):.1f}",
+                f"{sum(fitted) / len(fitted):.1f}",
+                f"{gain.mean:+.2f} ± {gain.standard_error:.2f}",
+                f"{run['seconds_of_fits']:.1f}",
+                f"{share:.0%}",
+            ]
+        )
     header = ["task, seed", "before the fit", "after", "gain ± s.e.", "CPU s", "share of training"]
     origins = "; ".join(sorted({origin_text(run["origin"]) for run in runs}))
-    (results / "README.md").write_text(
+    return (
         "# The last fit of the critics\n\nMade by `python benchmarks/paper/refits.py`. Do not edit."
         f" Imagined returns of the default preset's plan in {EPISODES} paired episodes, with the "
         "critics before and after they are fitted to returns, once at the end of training, also "
@@ -92,4 +87,4 @@ def write_table(results: Path) -> None:
 
 
 if __name__ == "__main__":
-    study(__doc__.splitlines()[0], RESULTS, measure, write_table)
+    study(__doc__.splitlines()[0], RESULTS, measure, page)

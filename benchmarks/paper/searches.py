@@ -11,8 +11,8 @@ results/searches/{task}-seed{seed}.json and README.md.
 
 from __future__ import annotations
 
-import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,8 @@ import torch
 
 from measures import paired_difference, study, train
 from phihp_torchrl import load_config
-from phihp_torchrl.evaluation import TARGETS, markdown_table
-from phihp_torchrl.origin import describe_origin, origin_text
+from phihp_torchrl.evaluation import markdown_table
+from phihp_torchrl.origin import origin_text
 from phihp_torchrl.trainers import PolicyTrainer, read_run_config
 
 RESULTS = Path("results/searches")
@@ -63,39 +63,34 @@ def measure(task: str, seed: int) -> dict[str, Any]:
         returns[name] = trained.plan(EPISODES, search)
         seconds[name] = time.process_time() - start
     return {
-        "task": task,
-        "seed": seed,
         "returns": returns,
         "seconds": seconds,
-        "origin": describe_origin(seed),
     }
 
 
-def write_table(results: Path) -> None:
+def page(runs: Sequence[dict[str, Any]]) -> str:
     """A row for each task, seed and search."""
-    runs = [json.loads(path.read_text()) for path in sorted(results.glob("*.json"))]
     rows = []
-    for task in TARGETS:
-        for run in (run for run in runs if run["task"] == task):
-            usual = torch.tensor(run["returns"]["preset"])
-            for name, found in run["returns"].items():
-                gain = paired_difference(torch.tensor(found), usual)
-                cost = run["seconds"][name] / run["seconds"]["preset"]
-                rows.append(
-                    [
-                        f"{task}, {run['seed']}",
-                        name,
-                        f"{sum(found) / len(found):.1f}",
-                        f"{gain.mean:+.2f} ± {gain.standard_error:.2f}",
-                        f"{cost:.2f}",
-                    ]
-                )
+    for run in runs:
+        usual = torch.tensor(run["returns"]["preset"])
+        for name, found in run["returns"].items():
+            gain = paired_difference(torch.tensor(found), usual)
+            cost = run["seconds"][name] / run["seconds"]["preset"]
+            rows.append(
+                [
+                    f"{run['task']}, {run['seed']}",
+                    name,
+                    f"{sum(found) / len(found):.1f}",
+                    f"{gain.mean:+.2f} ± {gain.standard_error:.2f}",
+                    f"{cost:.2f}",
+                ]
+            )
     header = ["task, seed", "search", "imagined return", "gain ± s.e.", "CPU time, of preset's"]
     origins = "; ".join(sorted({origin_text(run["origin"]) for run in runs}))
     said = "; ".join(
         f"{name}: `{' '.join(changes)}`" for name, changes in SEARCHES.items() if changes
     )
-    (results / "README.md").write_text(
+    return (
         "# Searches\n\nMade by `python benchmarks/paper/searches.py`. Do not edit. Imagined "
         f"returns of plans in {EPISODES} paired episodes, with the actor and the critics of one "
         "training by the task's default settings. The error is over episodes. CPU time is that of "
@@ -106,4 +101,4 @@ def write_table(results: Path) -> None:
 
 
 if __name__ == "__main__":
-    study(__doc__.splitlines()[0], RESULTS, measure, write_table)
+    study(__doc__.splitlines()[0], RESULTS, measure, page)

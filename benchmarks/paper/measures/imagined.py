@@ -15,6 +15,7 @@ import torch
 from phihp_torchrl import Agent, load_agent, load_config
 from phihp_torchrl.dynamics import TaskWorldModel
 from phihp_torchrl.evaluation import TARGETS
+from phihp_torchrl.origin import describe_origin
 from phihp_torchrl.planners import SearchConfig
 from phihp_torchrl.trainers import PolicyTrainer, play, read_run_config
 
@@ -83,15 +84,15 @@ def study(
     what: str,
     results: Path,
     measure: Callable[[str, int], dict[str, Any]],
-    write_table: Callable[[Path], None],
+    page: Callable[[Sequence[dict[str, Any]]], str],
 ) -> None:
-    """Measure tasks and seeds that are missing, as the command line says, and write the table.
+    """Measure tasks and seeds that are missing, as the command line says, and write the page.
 
     Args:
         what: the study, in a sentence.
         results: where a file for each task and seed goes, unless the command line says otherwise.
-        measure: of a task and a seed, what the file says.
-        write_table: of a directory of such files.
+        measure: of a task and a seed, what the file says besides these and its origin.
+        page: of what all files say, in the order of tasks and seeds, as Markdown.
     """
     parser = argparse.ArgumentParser(description=what)
     parser.add_argument("--tasks", nargs="+", choices=list(TARGETS), default=list(TARGETS))
@@ -106,6 +107,9 @@ def study(
         for task in options.tasks:
             path = options.results / f"{task}-seed{seed}.json"
             if not path.is_file():
-                path.write_text(json.dumps(measure(task, seed)) + "\n")
+                found = {"task": task, "seed": seed, **measure(task, seed)}
+                path.write_text(json.dumps(found | {"origin": describe_origin(seed)}) + "\n")
                 print(path.stem, flush=True)
-    write_table(options.results)
+    runs = [json.loads(path.read_text()) for path in options.results.glob("*.json")]
+    runs.sort(key=lambda run: ([*TARGETS].index(run["task"]), run["seed"]))
+    (options.results / "README.md").write_text(page(runs))

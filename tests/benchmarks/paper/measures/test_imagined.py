@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -31,15 +32,15 @@ def test_a_study_measures_what_is_missing(tmp_path: Path, monkeypatch: pytest.Mo
 
     def measure(task: str, seed: int) -> dict[str, int]:
         measured.append((task, seed))
-        return {"seed": seed}
+        return {"twice": 2 * seed}
 
-    def write_table(results: Path) -> None:
-        found = [json.loads(path.read_text())["seed"] for path in sorted(results.glob("*.json"))]
-        (results / "README.md").write_text(str(found))
+    def page(runs: Sequence[dict[str, Any]]) -> str:
+        assert all(run["origin"]["seed"] == run["seed"] for run in runs)
+        return str([(run["task"], run["seed"], run["twice"]) for run in runs])
 
-    for seeds in (["4"], ["4", "5"]):
+    for seeds in (["5"], ["4", "5"]):
         words = ["study", "--tasks", "acrobot", "--seeds", *seeds, "--results", str(tmp_path)]
         monkeypatch.setattr("sys.argv", words)
-        study("A study.", tmp_path / "unused", measure, write_table)
-    assert measured == [("acrobot", 4), ("acrobot", 5)]
-    assert (tmp_path / "README.md").read_text() == "[4, 5]"
+        study("A study.", tmp_path / "unused", measure, page)
+    assert measured == [("acrobot", 5), ("acrobot", 4)]
+    assert (tmp_path / "README.md").read_text() == "[('acrobot', 4, 8), ('acrobot', 5, 10)]"
