@@ -50,8 +50,8 @@ STAGES = {
 }
 """What makes each stage a grid of its own. Half of the published real samples, unless it says so.
 
-The three CEMs have the paper's budget by themselves. TD-MPC's networks and candidates by default
-are about a quarter of the published ones, which take a quarter of a second for an action here.
+The three CEMs have the paper's budget by themselves. TD-MPC's encoder by default has a half, its
+other networks and candidates a quarter of the published sizes (``latency.py`` has both times).
 """
 
 

@@ -49,8 +49,8 @@ _MOST_NAMES = 6
 """A sentence names no more comparisons of one verdict; the table has all."""
 
 REDUCED = (
-    "TD-MPC is of a reduced width here: its networks and candidates are about a quarter of the "
-    "published ones."
+    "TD-MPC is of a reduced width here: its encoder has a half, its other networks and its "
+    "candidates a quarter of the published sizes."
 )
 
 _PAIRS = (
