@@ -178,13 +178,7 @@ def planning_improves(results: Results) -> list[Finding]:
 
 def earns_more(results: Results, first: PaperSystem, second: PaperSystem) -> list[Finding]:
     """The difference of mean returns at the usual numbers of samples, by task."""
-    found = []
-    for task in TASKS:
-        sides = results.usual(first, task), results.usual(second, task)
-        seeds = _seeds(results, (first, second), task, sides, *map(_samples, sides))
-        planned = results.planned.both(first, second, task)
-        found.append(Pair(task, task, compared(*sides), seeds, planned))
-    return of_differences(found)
+    return of_differences([_usual(results, first, second, task, task) for task in TASKS])
 
 
 def hybrid_earns_more(results: Results) -> list[Finding]:
@@ -205,18 +199,28 @@ def not_worse(results: Results) -> list[Finding]:
 
     The difference plus the margin is tested, so that *shown* needs more than a small difference.
     """
-    found = []
-    for baseline, task in product(systems("baseline"), TASKS):
-        within = margin(task)
-        if within is None:
-            continue
-        sides = results.usual(PHIHP, task), results.usual(baseline, task)
-        seeds = _seeds(results, (PHIHP, baseline), task, sides, *map(_samples, sides))
-        planned = results.planned.both(PHIHP, baseline, task)
-        gap = compared(*sides, least=-within)
-        what = f"{baseline.name} on {task}"
-        found.append(Pair(what, task, gap, seeds, planned, least=-within))
-    return of_differences(found)
+    return of_differences(
+        [
+            _usual(results, PHIHP, baseline, task, f"{baseline.name} on {task}", -within)
+            for baseline, task in product(systems("baseline"), TASKS)
+            if (within := margin(task)) is not None
+        ]
+    )
+
+
+def _usual(
+    results: Results,
+    first: PaperSystem,
+    second: PaperSystem,
+    task: str,
+    what: str,
+    least: float = 0.0,
+) -> Pair:
+    """Two systems at their usual numbers of samples, to be tested for a difference above least."""
+    sides = results.usual(first, task), results.usual(second, task)
+    seeds = _seeds(results, (first, second), task, sides, *map(_samples, sides))
+    planned = results.planned.both(first, second, task)
+    return Pair(what, task, compared(*sides, least=least), seeds, planned, least=least)
 
 
 def _absent(
