@@ -19,7 +19,7 @@ from phihp_torchrl.trainers.run_config import FREE_KEYS, RunConfig, is_enabled
 from phihp_torchrl.trainers.run_directory import RunDirectory, new_run_directory
 from phihp_torchrl.trainers.run_request import read_run_config
 from phihp_torchrl.trainers.stored import read_stored
-from phihp_torchrl.trainers.trust import sign
+from phihp_torchrl.trainers.trust import CONTROLLER, controller_of, sign
 
 _log = logging.getLogger(__name__)
 
@@ -104,6 +104,13 @@ def _adopt(config: RunConfig) -> RunConfig:
             "unasked; expected them here too.",
         )
     theirs = _read_config(source)
+    controller = controller_of(theirs)
+    if controller is not None and controller != controller_of(config.to_mapping()):
+        raise ConfigError(
+            CONTROLLER,
+            f"the run in {source.path} has {controller!r}, and nothing that a folder names is "
+            "imported unasked; expected it here too.",
+        )
     if theirs["task"] != config.task:
         raise ConfigError(
             "from", f"{source.path} is of task {theirs['task']!r}, not {config.task!r}."

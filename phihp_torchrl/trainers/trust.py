@@ -21,6 +21,9 @@ from phihp_torchrl.config import (
 
 _log = logging.getLogger(__name__)
 
+CONTROLLER = "model.collect.exploration.controller"
+"""The setting that names what acts while real steps are collected, as ``module:function``."""
+
 
 def named_code(settings: Mapping[str, Any]) -> dict[str, str]:
     """What a run of these settings imports and calls besides this package, by key.
@@ -43,7 +46,17 @@ def named_code(settings: Mapping[str, Any]) -> dict[str, str]:
             found["world.id"] = str(name).partition(":")[0]
         if world.get("options"):  # arguments of whatever is called
             found["world.options"] = json.dumps(world["options"], sort_keys=True, default=str)
+    if (controller := controller_of(settings)) is not None:
+        found[CONTROLLER] = controller.partition(":")[0]
     return found
+
+
+def controller_of(settings: Mapping[str, Any]) -> str | None:
+    """The controller that settings name; ``None`` for none."""
+    value: Any = settings
+    for key in CONTROLLER.split("."):
+        value = value.get(key) if isinstance(value, Mapping) else None
+    return None if value is None else str(value)
 
 
 def sign(settings: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -148,5 +161,8 @@ def _file_of(name: str) -> Path | None:
 
 
 def _text(record: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
-    """What is signed."""
-    return digest_of_values({"record": record, "world": settings.get("world")})
+    """What is signed: the modules, and which functions of them are called."""
+    signed = {"record": record, "world": settings.get("world")}
+    if (controller := controller_of(settings)) is not None:
+        signed["controller"] = controller
+    return digest_of_values(signed)

@@ -1,4 +1,4 @@
-"""Folders of runs from strangers: none of 22 kinds executes, reads or writes what it names."""
+"""Folders of runs from strangers: none of 23 kinds executes, reads or writes what it names."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from safetensors.torch import save
 from tensordict import TensorDict
 from torchrl.checkpoint import CheckpointError
 
+from phihp_torchrl import load_config
 from phihp_torchrl.config import STATE_VARIABLE, ConfigError, compose_yaml, digest_of, sealed
-from phihp_torchrl.trainers import RunResult, read_request, run
+from phihp_torchrl.trainers import RunResult, read_request, read_run_config, run
 from phihp_torchrl.trainers.files import check_contained
 from phihp_torchrl.trainers.run_directory import RunDirectory
-from phihp_torchrl.trainers.trust import check_trusted, named_code, sign
+from phihp_torchrl.trainers.trust import CONTROLLER, check_trusted, named_code, sign
 
 from .run_parts import Crash
 from .tally import Tally, TallyConfig, tally_config
@@ -107,6 +108,11 @@ def module_of_gymnasium(folder: Folder) -> None:
 def arguments_of_gymnasium(folder: Folder) -> None:
     options = {"xml_file": "/etc/passwd"}
     folder.set(world={"kind": "gymnasium", "id": "Pendulum-v1", "options": options})
+
+
+def controller_of_exploration(folder: Folder) -> None:
+    Path("evil_controller.py").write_text(folder.code)
+    folder.set(model={"collect": {"exploration": {"controller": "evil_controller:act"}}})
 
 
 def variable(folder: Folder) -> None:
@@ -205,7 +211,7 @@ def pipe(folder: Folder) -> None:
 
 KINDS = (
     plugin_file, plugin_module, function_of_world, module_of_gymnasium, arguments_of_gymnasium,
-    variable, resolver, tag, references, nesting, size, adapter_of_torch, pickled_tensors,
+    controller_of_exploration, variable, resolver, tag, references, nesting, size, adapter_of_torch, pickled_tensors,
     tree_of_nonsense, nested_tree, random_state_of_nonsense, pickled_tensordict, path_outside,
     giant_header, linked_checkpoints, linked_table, pipe,
 )  # fmt: skip
@@ -341,9 +347,38 @@ def test_phases_of_a_stranger_bring_no_code(
     assert not folder.mark.exists()
 
 
+def test_a_model_of_a_stranger_brings_no_controller(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("evil_controller.py").write_text(f"import os\nos.mkdir({str(tmp_path / 'mark')!r})\n")
+    word = f"{CONTROLLER}=evil_controller:act"
+    theirs = load_config("pendulum", overrides=[word])
+    (tmp_path / "run").mkdir()
+    RunDirectory(tmp_path / "run").write_config(theirs)
+    later = ["phases=[policy]", f"from={tmp_path / 'run'}"]
+    with pytest.raises(ConfigError, match=f"^{CONTROLLER}: .*nothing that a folder names"):
+        run(read_run_config(load_config("pendulum", overrides=later)), tmp_path / "later")
+    assert not (tmp_path / "mark").exists()
+    with pytest.raises(CheckpointError):  # for there is no model, but the controller is asked for
+        run(read_run_config(load_config("pendulum", overrides=[*later, word])), tmp_path / "later")
+
+
+def test_which_function_of_a_controller_is_called_is_signed() -> None:
+    exploration = {"controller": "math:cos"}
+    settings = {"model": {"collect": {"exploration": exploration}}}
+    record = sign(settings)
+    check_trusted(settings, record)
+    exploration["controller"] = "math:sin"
+    with pytest.raises(ConfigError, match="not started like this"):
+        check_trusted(settings, record)
+    check_trusted(settings, record, given=[CONTROLLER])
+
+
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
+        ({"model": "none", "world": "simulated"}, {}),
         ({"world": "simulated"}, {}),
         ({"world": None, "plugins": None}, {}),
         ({"world": {"kind": "recorded", "files": "logs/*.csv"}}, {}),
