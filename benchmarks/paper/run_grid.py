@@ -5,7 +5,8 @@
 
 A finished cell is skipped, and refused if its settings are not those of now; one that was cut off
 goes on from its checkpoint, one that failed is reported. ``config/grid.yaml`` has more examples,
-and every key; ``make_report.py`` makes tables and figures of what is kept in results/runs/.
+and every key. What is kept of the runs is in results/trials/, and of the last proof's in
+results/runs/; ``make_report.py`` makes tables and figures of either.
 """
 
 from __future__ import annotations

@@ -18,13 +18,13 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from statistics import median
 
 from measures import DEFAULT_SAMPLES, agent_in, paired_difference_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, TARGETS, markdown_table
 from report.cells import configurations
 from report.overview import origins, put_between
 from report.runs import Run, read_runs
+from report.time_to_return import seconds_text
 
 RESULTS = Path("results/runs")
 START, END = "<!-- results:start -->", "<!-- results:end -->"
@@ -47,25 +47,11 @@ def chatter(run: Run, name: str) -> float:
     return float(evaluation[name].get("chatter", math.nan))
 
 
-def seconds_until(run: Run, level: float) -> float:
-    """Seconds of the run until its actor first earned ``level`` in the world; infinite if never.
-
-    The world's returns are logged with each evaluation in the phase policy, and choose nothing.
-    """
-    learning = (p for p in run.curve if p.phase == "policy" and p.acting == "actor")
-    return next((p.seconds for p in learning if p.return_mean >= level), math.inf)
-
-
 def times(runs: Sequence[Run], level: float) -> str:
-    """The median of these seconds, and how many runs got there, if not all.
-
-    A run that never did took longer than any; a mean over the others would flatter.
-    """
-    needed = [seconds_until(run, level) for run in runs]
-    reached = sum(seconds < math.inf for seconds in needed)
-    middle = median(needed)
-    text = f"{middle:.0f}" if middle < math.inf else "–"
-    return text if reached == len(runs) else f"{text} ({reached} of {len(runs)})"
+    """The median of the seconds to a return, and how many runs got there, if not all."""
+    middle, reached = seconds_text(runs, level)
+    text = "–" if middle is None else f"{middle:.0f}"
+    return text if reached == f"{len(runs)} of {len(runs)}" else f"{text} ({reached})"
 
 
 def spread(values: Sequence[float], digits: int) -> str:
@@ -124,8 +110,9 @@ def page(runs: Sequence[Run]) -> str:
         "the action from step to step in the second half of an episode, in half-ranges. *aim* is "
         "the return of version 0.1.0 (`benchmarks/paper/aims.json` says of which runs). *s to "
         "published* are the seconds of a run, its real steps and the fits of its model among them, "
-        "until the actor first earned the published mean "
-        "return of PhIHP in ten episodes of the world: the median over the runs, those that never "
+        "until it first earned the published mean return of PhIHP: its actor in ten episodes of "
+        "the world during training or in the fifty at the end, or else its plans in those, when "
+        "the calibration counts too. It is the median over the runs, those that never "
         "did among them as longer than any (how many did, if not all); *s in all* has "
         "calibration and the evaluation of 50 episodes too. Brackets are 95 % intervals over "
         "training seeds.\n\n"

@@ -18,7 +18,7 @@ from phihp_torchrl.planners import CEMConfig, make_planner
 from phihp_torchrl.systems import System
 from phihp_torchrl.tasks import Box
 
-# The published budget (SPEC section 4).
+# The published budget.
 CONFIG = CEMConfig(
     planning_horizon=5,
     optim_steps=3,

@@ -17,7 +17,7 @@ from phihp_torchrl.tdmpc import TOLD, make_latent_planner
 from phihp_torchrl.trainers import read_run_config
 
 AGENT = "results/agents/pendulum-swingup"
-# SPEC section 4, PendulumSwingup.
+# The published settings of PendulumSwingup.
 TASK = "pendulum-swingup"
 PUBLISHED = read_kind(PLANNERS, load_config(TASK, preset="paper")["planner"], "planner")
 

@@ -211,9 +211,9 @@ def pipe(folder: Folder) -> None:
 
 KINDS = (
     plugin_file, plugin_module, function_of_world, module_of_gymnasium, arguments_of_gymnasium,
-    controller_of_exploration, variable, resolver, tag, references, nesting, size, adapter_of_torch, pickled_tensors,
-    tree_of_nonsense, nested_tree, random_state_of_nonsense, pickled_tensordict, path_outside,
-    giant_header, linked_checkpoints, linked_table, pipe,
+    controller_of_exploration, variable, resolver, tag, references, nesting, size,
+    adapter_of_torch, pickled_tensors, tree_of_nonsense, nested_tree, random_state_of_nonsense,
+    pickled_tensordict, path_outside, giant_header, linked_checkpoints, linked_table, pipe,
 )  # fmt: skip
 
 

@@ -48,7 +48,8 @@ class GridConfig:
         retry_failed: whether to try cells again that ended with an error.
         only_plan: whether to note the cell as planned and leave it at that.
         runs: directory of the runs in full.
-        results: directory of what is kept of finished runs.
+        results: directory of what is kept of finished runs; ``None`` for results/runs with
+            ``proof``, else results/trials, so that no trial is among the cells of the proof.
         claim_wait: seconds to wait for a cell that another process holds, as one that was killed
             may do for a moment.
         jobs: runs at a time, for the launcher ``joblib``.
@@ -71,7 +72,7 @@ class GridConfig:
     retry_failed: bool = False
     only_plan: bool = False
     runs: str = "outputs/grid"
-    results: str = "results/runs"
+    results: str | None = None
     claim_wait: float = 10.0
     jobs: int = 2
     refresh: float = 2.0
@@ -136,7 +137,8 @@ class GridConfig:
 
     def files(self, root: Path) -> CellFiles:
         """The cell's files; relative directories are in ``root``."""
-        return CellFiles(self.cell(), root / self.runs, root / self.results)
+        results = self.results or ("results/runs" if self.proof else "results/trials")
+        return CellFiles(self.cell(), root / self.runs, root / results)
 
 
 def _refuse_first_seed(key: str, settings: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""What the paper's runs, and ours, may spend on a task (SPEC section 4)."""
+"""What the paper's runs, and ours, may spend on a task."""
 
 from __future__ import annotations
 
@@ -23,4 +23,4 @@ DEFAULT_SAMPLES = MappingProxyType({task: n // 2 for task, n in PUBLISHED_SAMPLE
 PUBLISHED_UPDATES = MappingProxyType(
     {task: 2_000_000 if task == "acrobot-swingup" else 500_000 for task in PUBLISHED_SAMPLES}
 )
-"""Imagined steps of the paper, each with an update, by task (SPEC section 4)."""
+"""Imagined steps of the paper, each with an update, by task."""

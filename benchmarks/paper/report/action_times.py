@@ -11,7 +11,7 @@ from statistics import median
 import numpy as np
 
 from measures import RESAMPLES
-from report.paper_systems import TD_MPC, PaperSystem
+from report.paper_systems import PHIHP, TD_MPC, PaperSystem
 from report.results import TASKS
 from report.verdicts import NOT_SHOWN, REFUTED, SHOWN, Finding
 
@@ -31,34 +31,50 @@ def read_turns(directory: Path) -> tuple[Turns, list[str]]:
     for path in sorted(directory.glob("*.json")):
         try:
             found[path.stem] = json.loads(path.read_text())["turns"]
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:
             problems.append(f"{path}: {type(error).__name__}: {error}")
     return found, problems
 
 
-def acting_time(turns: Turns, system: PaperSystem, task: str) -> float | None:
+_NAMES = {
+    (PHIHP, "default"): "PhIHP",
+    (PHIHP, "paper"): "PhIHP, published",
+    (TD_MPC, "default"): f"TD-MPC, {WIDTHS[1]}",
+    (TD_MPC, "paper"): f"TD-MPC, {WIDTHS[0]}",
+}
+"""What the turns call systems whose sizes depend on the preset."""
+
+
+def acting_time(turns: Turns, system: PaperSystem, task: str, preset: str | None) -> float | None:
     """Milliseconds for an action of a system as it is used: compiled where it plans.
 
-    TD-MPC's are those of the reduced width, which its runs here have.
+    Args:
+        turns: all that were measured.
+        system: the system.
+        task: name of the task.
+        preset: that of its runs, whose sizes it has.
     """
-    name = f"{system.name}, {WIDTHS[1]}" if system == TD_MPC else system.name
+    sized = {sizes for one, sizes in _NAMES if one == system}
+    if sized and preset not in sized:
+        return None
+    name = _NAMES.get((system, preset or ""), system.name)
     for mode in reversed(MODES):
         if found := turns.get(task, {}).get(f"{name}, {mode}"):
             return median(found)
     return None
 
 
-def faster(turns: Turns) -> list[Finding]:
-    """TD-MPC's time of an action over PhIHP's, by its width, by mode and by task.
+def faster(turns: Turns, preset: str | None = "default") -> list[Finding]:
+    """TD-MPC's time of an action over that of PhIHP's preset, by TD-MPC's width, mode and task.
 
     All methods took turns in one process, so that the ratio is of turns of one round, and the
     interval, a percentile bootstrap, is of its median over rounds. It says how steady one process
     of one machine was, and is adjusted for nothing.
     """
-    findings = []
+    findings, name = [], _NAMES.get((PHIHP, preset or ""))
     for width, mode, task in product(WIDTHS, MODES, TASKS):
         found = turns.get(task, {})
-        ours, theirs = found.get(f"PhIHP, {mode}"), found.get(f"TD-MPC, {width}, {mode}")
+        ours, theirs = found.get(f"{name}, {mode}"), found.get(f"TD-MPC, {width}, {mode}")
         if ours and theirs:
             findings.append(_of_turns(f"TD-MPC, {width}, {mode} on {task}", ours, theirs))
     return findings

@@ -94,12 +94,13 @@ def profiles(
 def score_matrix(
     results: Results, system: PaperSystem, tasks: Sequence[str]
 ) -> NDArray[np.float64] | None:
-    """Normalised returns ``[seeds, tasks]``; ``None`` if some task was not run.
+    """Normalised returns ``[seeds, tasks]``; ``None`` if there is no average over the tasks.
 
     Where tasks have been run with different numbers of seeds, the first ones of each are taken, as
     many as all have.
     """
-    columns = [[s.normalised for s in results.usual(system, task)] for task in tasks]
+    scores = results.averaged(system, tasks) or []
+    columns = [[score.normalised for score in of_task] for of_task in scores]
     seeds = min(map(len, columns), default=0)
     return np.array([column[:seeds] for column in columns]).T if seeds else None
 

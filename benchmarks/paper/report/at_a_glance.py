@@ -12,7 +12,7 @@ from measures import Between, mean_between
 from phihp_torchrl.evaluation import PUBLISHED
 from report.action_times import Turns, acting_time
 from report.bounds import normalise
-from report.claims import REDUCED
+from report.claims import REDUCED, is_reduced
 from report.efficiency import sample_efficiency
 from report.paper_systems import PaperSystem, systems
 from report.results import SIX_TASKS, Results
@@ -25,8 +25,9 @@ _PUBLISHED_VARIANTS = {"cartpole-swingup": "cartpole-swingup-published"}
 
 @dataclass(frozen=True)
 class _Compromise:
-    """What a system is on the three metrics, each a mean over the six tasks."""
+    """What a system is on the three metrics, each a mean over the six tasks, and of which seeds."""
 
+    seeds: str
     score: float
     samples: Between | None
     milliseconds: float | None
@@ -39,14 +40,22 @@ def at_a_glance(results: Results, turns: Turns | None = None) -> Section:
         results: the scores.
         turns: times of an action (:func:`~report.action_times.read_turns`).
     """
+    reduced = f" {REDUCED}" if is_reduced(results) else ""
     figure = Figure(figsize=(9.0, 3.8), layout="constrained")
     samples_axis, time_axis = figure.subplots(1, 2, sharey=True)
     header = ["system", "normalised return", "real samples to 90 %", "ms for an action"]
-    header += [f"{name}, published" for name in header[1:]]
+    header += ["seeds", *(f"{name}, published" for name in header[1:])]
     rows: list[list[TableCell]] = []
     for i, system in enumerate(systems("ours", "baseline")):
         ours, theirs = _measured(results, turns or {}, system), _published(system)
-        rows.append([system.name, *_cells(ours, NOT_RUN), *_cells(theirs, "–")])
+        rows.append(
+            [
+                system.name,
+                *_cells(ours, NOT_RUN),
+                NOT_RUN if ours is None else ours.seeds,
+                *_cells(theirs, "–"),
+            ]
+        )
         for found, filled in ((ours, True), (theirs, False)):
             if found is not None:
                 name = system.name if filled else f"{system.name}, published"
@@ -62,11 +71,12 @@ def at_a_glance(results: Results, turns: Turns | None = None) -> Section:
         time_axis.legend(fontsize="x-small", loc="center left", bbox_to_anchor=(1.0, 0.5))
     return Section(
         "At a glance",
-        "Means over the six tasks, of a system that was run on all of them: of returns between "
-        "bounds (`docs/evaluation.md`), of what the real samples to 90 % lie between, and of the "
-        "time of an action, of compiled plans (`results/latency`). *Published*: the same from the "
-        "paper's numbers, with its own CartPoleSwingup and on an Apple M1; nothing where it has "
-        f"none. {REDUCED}",
+        "Means over the six tasks, of a system that was run on all of them, with one share of the "
+        "published real samples: of returns between bounds (`docs/evaluation.md`), of what the "
+        "real samples to 90 % lie between, and of the time of an action, of compiled plans "
+        "(`results/latency`). *Seeds* are those of a task, from the fewest to the most; a few say "
+        "little. *Published*: the same from the paper's numbers, with its own CartPoleSwingup and "
+        "on an Apple M1; nothing where it has none." + reduced,
         {"Over the six tasks": Table("at_a_glance", header, rows)},
         [
             Picture(
@@ -80,15 +90,19 @@ def at_a_glance(results: Results, turns: Turns | None = None) -> Section:
 
 def _measured(results: Results, turns: Turns, system: PaperSystem) -> _Compromise | None:
     """``None`` unless the system was run on all six tasks."""
-    scores = [results.usual(system, task) for task in SIX_TASKS]
-    if not all(scores):
+    scores = results.averaged(system)
+    if scores is None:
         return None
-    times = [acting_time(turns, system, task) for task in SIX_TASKS]
+    preset = results.preset(system)
+    times = [acting_time(turns, system, task, preset) for task in SIX_TASKS]
     known = [time for time in times if time is not None]
     samples = [sample_efficiency(results, system, task) for task in SIX_TASKS]
+    between = [each for each in samples if each is not None]
+    seeds = sorted({len(of_task) for of_task in scores})
     return _Compromise(
+        "–".join(map(str, dict.fromkeys((seeds[0], seeds[-1])))),
         fmean(fmean(score.normalised for score in of_task) for of_task in scores),
-        mean_between([between for between in samples if between is not None]),
+        mean_between(between) if len(between) == len(SIX_TASKS) else None,
         fmean(known) if len(known) == len(SIX_TASKS) else None,
     )
 
@@ -102,6 +116,7 @@ def _published(system: PaperSystem) -> _Compromise | None:
         return None
     samples = [1000 * row.samples for row in known if row.samples is not None]
     return _Compromise(
+        "10",
         fmean(normalise(t, row.return_mean) for t, row in zip(tasks, known, strict=True)),
         Between(fmean(samples), fmean(samples)) if len(samples) == len(tasks) else None,
         fmean(row.milliseconds for row in known),

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from phihp_torchrl.config import ConfigError, check_count
+from phihp_torchrl.evaluation import PROOF_SEED
 from phihp_torchrl.trainers import import_plugins
 from report.ablation import ablation
 from report.action_times import read_turns
@@ -21,7 +22,7 @@ from report.overview import origins, overview
 from report.planned import planned_section, read_planned
 from report.planner_and_actor import acting_section
 from report.results import Results
-from report.runs import read_runs
+from report.runs import Run, read_runs
 from report.sections import Section
 from report.sensitivity import read_trials, sensitivity
 from report.significance import significance
@@ -78,6 +79,21 @@ class Report:
     problems: tuple[str, ...]
 
 
+def _of_the_proof(runs: Sequence[Run], problems: list[str]) -> list[Run]:
+    """Those of the last proof, if there are any: others have played other episodes.
+
+    Args:
+        runs: runs with one label.
+        problems: where those that are left out are named.
+    """
+    proof = [run for run in runs if run.first_seed == PROOF_SEED]
+    others = [run.folder.name for run in runs if run.first_seed != PROOF_SEED]
+    if not (proof and others):
+        return [*runs]
+    problems.append(f"Not of the last proof, and left out: {', '.join(others)}.")
+    return proof
+
+
 def make_report(config: ReportConfig) -> Report:
     """Make all of a report that can be made, and write it.
 
@@ -99,7 +115,7 @@ def make_report(config: ReportConfig) -> Report:
             f"expected finished runs in {config.runs}, could read none of "
             f"{len(folders.problems)}; the first says: {folders.problems[0]}",
         )
-    chosen = [run for run in folders.runs if run.label == config.label]
+    chosen = _of_the_proof([run for run in folders.runs if run.label == config.label], problems)
     every = read_planned(Path(config.runs))
     planned = every.of(config.label)
     results = Results(chosen, planned)

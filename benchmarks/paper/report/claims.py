@@ -75,7 +75,7 @@ def claims_section(results: Results, turns: Turns | None = None) -> Section:
         "PhIHP earns more than TD3": earns_more(results, PHIHP, TD3),
         "Planning improves on the policy": planning_improves(results),
         "The hybrid model beats the data-driven one at equal samples": hybrid_earns_more(results),
-        "PhIHP acts faster than TD-MPC": faster(turns or {}),
+        "PhIHP acts faster than TD-MPC": faster(turns or {}, results.preset(PHIHP)),
         f"PhIHP earns as much as each baseline, to {EQUIVALENT:.0%} of a task's range": not_worse(
             results
         ),
@@ -94,7 +94,7 @@ def claims_section(results: Results, turns: Turns | None = None) -> Section:
     ]
     if published := _published_samples(results):
         lines.append(f"- {published}")
-    if any(results.has_run(TD_MPC, task) for task in TASKS):
+    if is_reduced(results):
         lines.append(f"- {REDUCED}")
     rows: list[list[TableCell]] = [
         [f"{i}, {f.what}", f.verdict, f.effect, f.ends, f.interval, f.seeds]
@@ -106,6 +106,11 @@ def claims_section(results: Results, turns: Turns | None = None) -> Section:
     return Section(
         "The paper's claims", "\n".join(lines), {"Comparisons": Table("claims", header, rows)}
     )
+
+
+def is_reduced(results: Results) -> bool:
+    """Whether a run of TD-MPC has the affordable widths of the default preset."""
+    return any(run.method == "td-mpc" and run.preset == "default" for run in results.runs)
 
 
 def sentence(findings: Sequence[Finding], *, done: bool = False) -> str:
@@ -143,8 +148,16 @@ def fewer_samples(results: Results) -> list[Finding]:
     """TD-MPC's samples to 90 % over PhIHP's, by task, as far as their ends tell."""
     findings = []
     for task in TASKS:
-        ours, theirs = (efficiency_of_seeds(results, one, task) for one in (PHIHP, TD_MPC))
-        scores = [results.scores(one, task) for one in (PHIHP, TD_MPC)]
+        both = PHIHP, TD_MPC
+        ours, theirs = (efficiency_of_seeds(results, one, task) for one in both)
+        scores = [results.whole(one, task) for one in both]
+        seeds = ", ".join(
+            _of_planned(
+                len({score.run.seed for score in of_one}),
+                results.planned.whole_seeds(one, task, _samples(of_one)),
+            )
+            for one, of_one in zip(both, scores, strict=True)
+        )
         if ours and theirs:
             between = mean_between(theirs), mean_between(ours)
             findings.append(
@@ -155,11 +168,12 @@ def fewer_samples(results: Results) -> list[Finding]:
                     FEWER,
                     f"{between[1]} against {between[0]} samples",
                     [score for side in scores for score in side],
-                    _seeds(results, (PHIHP, TD_MPC), task, (ours, theirs), *map(_samples, scores)),
+                    seeds,
                 )
             )
-        elif results.planned.both(PHIHP, TD_MPC, task):
-            findings.append(_absent(results, (PHIHP, TD_MPC), task, scores))
+        elif results.planned.both(*both, task):
+            verdict = NOT_MEASURED if all(scores) else NOT_RUN
+            findings.append(Finding(task, verdict, "–", "–", "–", seeds))
     return findings
 
 
@@ -186,11 +200,17 @@ def hybrid_earns_more(results: Results) -> list[Finding]:
     found = []
     for (first, second), task in product(_PAIRS, TASKS):
         asked = results.planned.at_equal_samples(first, second, task)
-        for number in sorted(_equal_samples(results, first, second, task) | asked):
+        run = _equal_samples(results, first, second, task)
+        for number in sorted(run | {number for number in asked if number is not None}):
             sides = results.at(number, first, task), results.at(number, second, task)
             seeds = _seeds(results, (first, second), task, sides, {number}, {number})
             what = f"{first.name} on {task}, {number} samples"
-            found.append(Pair(what, task, compared(*sides), seeds, number in asked))
+            planned = not asked.isdisjoint({None, number})
+            found.append(Pair(what, task, compared(*sides), seeds, planned))
+        if None in asked and not run:  # a number that is known when both are run
+            each = results.scores(first, task), results.scores(second, task)
+            seeds = _seeds(results, (first, second), task, each, set(), set())
+            found.append(Pair(f"{first.name} on {task}", task, None, seeds, True))
     return of_differences(found)
 
 
@@ -221,17 +241,6 @@ def _usual(
     seeds = _seeds(results, (first, second), task, sides, *map(_samples, sides))
     planned = results.planned.both(first, second, task)
     return Pair(what, task, compared(*sides, least=least), seeds, planned, least=least)
-
-
-def _absent(
-    results: Results,
-    both: tuple[PaperSystem, PaperSystem],
-    task: str,
-    scores: Sequence[Sequence[Score]],
-) -> Finding:
-    """That of a comparison that was planned, of which a side has no run."""
-    seeds = _seeds(results, both, task, scores, *map(_samples, scores))
-    return Finding(task, NOT_RUN, "–", "–", "–", seeds)
 
 
 def _seeds(

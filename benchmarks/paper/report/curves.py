@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from phihp_torchrl.evaluation import PUBLISHED
 from report.bounds import normalise
 from report.efficiency import points_by_seed
-from report.learning_curve import draw_learning_curves, learning_curve
+from report.learning_curve import draw_learning_curves, held, learning_curve
 from report.paper_systems import PHIHP, TD3, PaperSystem, systems
 from report.results import SIX_TASKS, Results
 from report.sections import Picture, Section
@@ -25,14 +25,15 @@ def learning_curves(results: Results) -> Section:
     over_tasks = {}
     missing = []
     for system in compared:
-        by_task = {task: points_by_seed(results.scores(system, task)) for task in SIX_TASKS}
+        by_task = {task: points_by_seed(results.whole(system, task)) for task in SIX_TASKS}
         if all(by_task.values()):
             over_tasks[system.name] = [mean_over_tasks(by_task)]
         else:
             missing.append(system.name)
     text = (
         "A thin line for each seed, a thick one for their mean; a system that learns its policy in "
-        "a model has a point for each number of samples that it was given."
+        "a model has a point for each number of samples that it was given, of the seeds that were "
+        "given all of them. Between two evaluations a return stays what it was."
     )
     if missing:
         text += f" Not run on all six tasks, so not in the average: {', '.join(missing)}."
@@ -78,7 +79,7 @@ def sample_curves(results: Results, compared: Sequence[PaperSystem], task: str) 
     """Real samples and returns of each seed, for the systems that were run."""
     curves = {}
     for system in compared:
-        points = points_by_seed(results.scores(system, task)).values()
+        points = points_by_seed(results.whole(system, task)).values()
         if points:
             curves[system.name] = [tuple(zip(*seed, strict=True)) for seed in points]
     return curves  # type: ignore[return-value]
@@ -123,7 +124,7 @@ def mean_over_tasks(
         lines = []
         for points in seeds.values():
             x, y = np.array([p[0] for p in points]), [normalise(task, p[1]) for p in points]
-            lines.append(np.array(y)[np.searchsorted(x, grid, side="right") - 1])
+            lines.append(held(x, np.array(y), grid))
         means.append(np.mean(lines, axis=0))
     return grid, np.mean(means, axis=0)
 

@@ -7,27 +7,34 @@ from collections.abc import Sequence
 
 from measures import Between, mean_between
 from report.paper_systems import PaperSystem
-from report.results import Results, Score, well_filled
+from report.results import Results, Score
 from report.tables import Ends
 
 SHARE = 0.9
 """The share of its own best return that a system must reach."""
+
+ONE_NUMBER = "one number"
+"""What stands where a system was run with one number of real samples, which tells nothing."""
 
 
 def learning_points(score: Score) -> list[tuple[int, float]]:
     """Real samples and mean return at the evaluations of a run, with rising samples.
 
     A run that learns its policy in a model takes no real step meanwhile: of evaluations at the
-    same number of samples, the last counts.
+    same number of samples, the last counts. An agent that plans, of which only the actor was
+    evaluated while it took real steps, has the actor's curve.
 
     Args:
         score: the run, and how it acts.
     """
-    only_way = len(score.run.acting) == 1
-    points = {p.real_steps: p.return_mean for p in score.run.curve
-              if only_way or p.acting == score.acting}  # fmt: skip
+    run, way = score.run, score.acting
+    learning = {p.acting for p in run.curve if p.phase != "evaluate"}
+    if way not in learning and len({p.real_steps for p in run.curve}) > 1 and "actor" in run.acting:
+        way = "actor"  # which alone was evaluated while it took real steps
+    only_way = len(run.acting) == 1
+    points = {p.real_steps: p.return_mean for p in run.curve if only_way or p.acting == way}
     # The final evaluation is of the agent that is kept, and over more episodes.
-    points[max(points, default=score.run.samples)] = score.mean
+    points[max(points, default=run.samples)] = run.acting[way].mean
     return sorted(points.items())
 
 
@@ -63,29 +70,24 @@ def samples_to_90(points: Sequence[tuple[int, float]]) -> Between:
 
 
 def efficiency_of_seeds(results: Results, system: PaperSystem, task: str) -> list[Between]:
-    """What the samples of each seed lie between, by seed.
+    """What the samples of each seed lie between, by seed (:meth:`Results.whole`).
 
-    Those seeds count that were run at every number of samples of which there are enough seeds: one
-    that was run at the most alone would have wide ends, which say how it was planned and not how
-    soon it learns. Where there is no such seed all count.
+    Of a seed with a return at one number of samples alone nothing is known: that return is its best
+    one, whatever it is. A system that needs none has 0.
     """
-    scores = results.scores(system, task)
-    usual = well_filled(score.run.samples for score in scores)
-    numbers: dict[int, set[int]] = defaultdict(set)
-    for score in scores:
-        numbers[score.run.seed].add(score.run.samples)
-    whole = {seed for seed, found in numbers.items() if usual <= found} or {*numbers}
-    points = points_by_seed([score for score in scores if score.run.seed in whole])
-    return [samples_to_90(of_seed) for of_seed in points.values()]
+    points = points_by_seed(results.whole(system, task)).values()
+    return [samples_to_90(of_seed) for of_seed in points if len(of_seed) > 1 or not of_seed[0][0]]
 
 
 def sample_efficiency(results: Results, system: PaperSystem, task: str) -> Between | None:
-    """What a system's mean over seeds lies between; ``None`` if it was not run."""
+    """What a system's mean over seeds lies between; ``None`` if nothing is known of it."""
     found = efficiency_of_seeds(results, system, task)
     return mean_between(found) if found else None
 
 
-def samples_cell(results: Results, system: PaperSystem, task: str) -> Ends:
+def samples_cell(results: Results, system: PaperSystem, task: str) -> Ends | str:
     """The same for a table, with the number of seeds."""
     found = efficiency_of_seeds(results, system, task)
+    if not found and results.has_run(system, task):
+        return ONE_NUMBER
     return Ends(mean_between(found) if found else None, len(found))

@@ -40,6 +40,16 @@ def learning_curve(
     return figure
 
 
+def held(x: np.ndarray, y: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Returns ``y [k]`` of evaluations at ``x [k]`` as they stand at later places ``grid [n]``.
+
+    Examples:
+        >>> held(np.array([0, 10]), np.array([1.0, 2.0]), np.array([0, 5, 10, 15])).tolist()
+        [1.0, 1.0, 2.0, 2.0]
+    """
+    return np.asarray(y)[np.searchsorted(x, grid, side="right") - 1]
+
+
 def draw_learning_curves(
     axis: Axes,
     curves: Mapping[str, Sequence[tuple[ArrayLike, ArrayLike]]],
@@ -54,7 +64,7 @@ def draw_learning_curves(
         for x, y in runs:
             one = len(runs) == 1
             axis.plot(x, y, color=color, linewidth=2 if one else 0.7, alpha=1 if one else 0.5,
-                      marker="o" if len(x) == 1 else None, markersize=4,
+                      marker="o" if len(x) == 1 else None, markersize=4, drawstyle="steps-post",
                       label=method if one else None)  # fmt: skip
             largest = max(largest, float(x.max()))
             smallest = min(smallest, *(float(v) for v in x[x > 0]), math.inf)
@@ -63,9 +73,9 @@ def draw_learning_curves(
             grid = np.unique(np.concatenate([x for x, _ in runs]))
             low, high = max(x[0] for x, _ in runs), min(x[-1] for x, _ in runs)
             grid = grid[(grid >= low) & (grid <= high)]
-            mean = np.mean([np.interp(grid, x, y) for x, y in runs], axis=0)
+            mean = np.mean([held(x, y, grid) for x, y in runs], axis=0)
             axis.plot(grid, mean, color=color, linewidth=2, marker="D" if len(grid) == 1 else None,
-                      label=f"{method} ({len(runs)} seeds)")  # fmt: skip
+                      drawstyle="steps-post", label=f"{method} ({len(runs)} seeds)")  # fmt: skip
     for name, level in (reference or {}).items():
         axis.axhline(level, color="0.4", linestyle="--", linewidth=1, label=name)
     if largest > 50 * smallest:

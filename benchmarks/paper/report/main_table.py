@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from phihp_torchrl.evaluation import PUBLISHED, Published
-from report.efficiency import samples_cell
+from report.efficiency import ONE_NUMBER, samples_cell
 from report.paper_systems import PaperSystem, systems
 from report.results import Results
 from report.sections import Section
@@ -16,24 +16,28 @@ def main_table(results: Results) -> Section:
     """A table for each of the three metrics."""
 
     def returns(system: PaperSystem, task: str) -> Stat:
-        return Stat(tuple(score.mean for score in results.usual(system, task)))
+        scores, note = results.usual(system, task), results.unlike_usual(system, task)
+        return Stat(tuple(score.mean for score in scores), note=note)
 
-    def samples(system: PaperSystem, task: str) -> Ends:
+    def samples(system: PaperSystem, task: str) -> Ends | str:
         return samples_cell(results, system, task)
 
     def milliseconds(system: PaperSystem, task: str) -> Stat:
         times = (score.milliseconds for score in results.usual(system, task))
-        return Stat(tuple(time for time in times if time is not None), 2)
+        note = results.unlike_usual(system, task)
+        return Stat(tuple(time for time in times if time is not None), 2, note)
 
     return Section(
         "Main table",
         "Mean ± std over seeds (number of seeds); under *published*, the paper's numbers, mean ± "
         "std over 10 runs, times on an Apple M1. The paper's CartPoleSwingup is "
         "`cartpole-swingup-published`. Returns and times are those at the default preset's "
-        "number of real samples, or at the most where there is no such run. Real samples to 90 % "
-        "are known by their ends alone: between the evaluation that first reached it and the one "
-        "before; what stands is what the mean over seeds lies between, and ≤ where the first "
-        "evaluation was there already.",
+        "number of real samples, or at the most of which there are enough seeds, where the number "
+        "stands beside them. Times are those of runs, which compile nothing and share the machine; "
+        "*At a glance* has compiled ones. Real samples to 90 % are known by their ends alone: "
+        "between the evaluation that first reached it and the one before; what stands is what the "
+        "mean over seeds lies between, and ≤ where the first evaluation was there already. Runs "
+        f"with {ONE_NUMBER} of real samples do not say it.",
         {
             "Return": _table("main_return", results.tasks, returns, _published_return),
             "Real samples to 90 % of the best return": _table(

@@ -34,7 +34,9 @@ def aggregate_section(results: Results, reps: int) -> Section:
         "Performance over runs",
         "Normalised returns, a score for each seed; intervals are 95 % percentile bootstrap, "
         f"stratified by task, {reps} resamples (rliable). An interval of one seed is no interval. "
-        "The six tasks are all but `cartpole-swingup-published`.",
+        "The six tasks are all but `cartpole-swingup-published`; where they have different numbers "
+        "of seeds, as many are taken of each as all have, the first ones, and a system whose tasks "
+        "have different shares of the published samples is in no average.",
         {
             "Over the six tasks": _over_tasks(estimates[OVER_TASKS]),
             **{

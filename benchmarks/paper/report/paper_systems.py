@@ -45,6 +45,17 @@ class PaperSystem:
     sources: tuple[tuple[str, str | None], ...]
 
 
+def has_share(method: str) -> bool:
+    """Whether a method takes a share of the published real samples, by which its model is fitted.
+
+    Examples:
+        >>> has_share("dd-phihp"), has_share("td3"), has_share("of a plugin that is not here")
+        (True, False, False)
+    """
+    known = METHODS.get(method)
+    return known is not None and known.samples_key == "model.real_steps"
+
+
 def system(method: str) -> PaperSystem:
     """What tables have of a registered method.
 

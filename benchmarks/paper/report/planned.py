@@ -12,17 +12,13 @@ from grid.cell import Cell, CellFiles
 from grid.planned import read_cells
 from grid.status import read_failure
 from measures import DEFAULT_SAMPLES
-from phihp_torchrl.config import METHODS
-from report.paper_systems import PaperSystem
+from report.paper_systems import PaperSystem, has_share
 from report.runs import Run
 from report.sections import Section
 from report.tables import Number, Table, TableCell
 
 _LONGEST = 160
 """Characters of an error in a table; all of it is in ``failure.json``."""
-
-_SAMPLES_KEY = "model.real_steps"
-"""What a preset has a number of real samples for, by task."""
 
 
 def samples_of(cell: Cell) -> int | None:
@@ -36,8 +32,7 @@ def samples_of(cell: Cell) -> int | None:
     """
     if cell.samples is not None:
         return cell.samples
-    method = METHODS.get(cell.method)  # without its plugin it is not known
-    return DEFAULT_SAMPLES.get(cell.task) if method and method.samples_key == _SAMPLES_KEY else None
+    return DEFAULT_SAMPLES.get(cell.task) if has_share(cell.method) else None
 
 
 @dataclass(frozen=True)
@@ -74,20 +69,31 @@ class Planned:
             }
         )
 
+    def whole_seeds(self, system: PaperSystem, task: str, samples: Collection[int]) -> int:
+        """The number of training seeds that were planned at every one of these numbers."""
+        planned: dict[int, set[int | None]] = defaultdict(set)
+        for cell in self._cells(system, task):
+            planned[cell.seed].add(samples_of(cell))
+        return sum(None in found or {*samples} <= found for found in planned.values())
+
     def both(self, first: PaperSystem, second: PaperSystem, task: str) -> bool:
         """Whether a comparison of two systems on a task was planned."""
         return self.seeds(first, task) > 0 and self.seeds(second, task) > 0
 
-    def at_equal_samples(self, first: PaperSystem, second: PaperSystem, task: str) -> set[int]:
-        """The numbers of real samples at which a comparison of two systems was planned."""
+    def at_equal_samples(
+        self, first: PaperSystem, second: PaperSystem, task: str
+    ) -> set[int | None]:
+        """The numbers of real samples at which a comparison of two systems was planned.
+
+        ``None`` is among them where both have a number of their own, which nobody knows before they
+        are run.
+        """
         sides = [
             {samples_of(cell) for cell in self._cells(system, task)} for system in (first, second)
         ]
-        return {
-            number
-            for number in set.union(*sides)
-            if number is not None and all({None, number} & side for side in sides)
-        }
+        return {n for n in set.union(*sides) if all({None, n} & side for side in sides)} - (
+            set() if all(None in side for side in sides) else {None}
+        )
 
     def _cells(self, system: PaperSystem, task: str) -> list[Cell]:
         """Those of any of a system's methods on a task."""

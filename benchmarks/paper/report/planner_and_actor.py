@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from itertools import product
 
 from measures import (
     PUBLISHED_SAMPLES,
@@ -22,18 +23,26 @@ from report.runs import Run
 from report.sections import Section
 from report.tables import Number, Stat, Table, TableCell
 
-_SHARES = {"all samples": 1.0, "a half": 0.5, "a fifth": 0.2, "a tenth": 0.1}
+_SHARES = {
+    "all samples": 1.0,
+    "a half": 0.5,
+    "a tenth": 0.1,
+    "a twentieth": 0.05,
+    "a fiftieth": 0.02,
+    "a hundredth": 0.01,
+}
 _WAYS = (AGENT, "actor")
+_WITH_ACTORS = {"phihp": "PhIHP", "dd-phihp": "dd-PhIHP"}
 
 
-def both_ways(runs: Iterable[Run]) -> dict[tuple[str, int], list[Run]]:
-    """PhIHP's runs by task and number of samples: the paper's order, many samples before few.
+def both_ways(runs: Iterable[Run], method: str = "phihp") -> dict[tuple[str, int], list[Run]]:
+    """A method's runs by task and number of samples: the paper's order, many samples before few.
 
     Those whose calibration lets the actor act are among them, as any run whose actor was played.
     """
     groups = defaultdict(list)
     for run in runs:
-        if run.method == "phihp" and "actor" in run.acting:
+        if run.method == method and "actor" in run.acting:
             groups[run.task, run.samples].append(run)
     order = {task: i for i, task in enumerate(PUBLISHED_SAMPLES)}
     return dict(
@@ -87,7 +96,7 @@ def acting_section(runs: Sequence[Run], planned: Planned | None = None) -> Secti
         "paper's claims*. The times are means, those of plans over the seeds that plan.",
         {
             "What planning adds to the actor, the same episodes": _gain_table(groups, planned),
-            "Returns with fewer real samples": _samples_table(groups),
+            "Returns with fewer real samples": _samples_table(runs),
             "Time": _time_table(groups),
         },
     )
@@ -106,11 +115,13 @@ def _gain_table(groups: dict[tuple[str, int], list[Run]], planned: Planned) -> T
     return Table("planning_gain", header, rows)
 
 
-def _samples_table(groups: dict[tuple[str, int], list[Run]]) -> Table:
+def _samples_table(runs: Sequence[Run]) -> Table:
+    """Returns of PhIHP and of its twin without a prior, at each share of the published samples."""
     rows: list[list[TableCell]] = []
+    by_method = {system: both_ways(runs, method) for method, system in _WITH_ACTORS.items()}
     for task, published in PUBLISHED_SAMPLES.items():
-        for way in _WAYS:
-            row: list[TableCell] = [f"{task}, {way}"]
+        for (system, groups), way in product(by_method.items(), _WAYS):
+            row: list[TableCell] = [f"{task}, {system}, {way}"]
             for share in _SHARES.values():
                 group = groups.get((task, round(published * share)), [])
                 row.append(Stat(tuple(means(group, way))))

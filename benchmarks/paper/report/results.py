@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from measures import DEFAULT_SAMPLES, FEWEST_SEEDS, PUBLISHED_SAMPLES, agent_in
 from phihp_torchrl.evaluation import TARGETS
 from report.bounds import normalise
-from report.paper_systems import AGENT, PaperSystem
+from report.paper_systems import AGENT, PaperSystem, has_share
 from report.planned import Planned
 from report.runs import Acting, Run
 
@@ -39,6 +39,31 @@ def well_filled(*sides: Iterable[int]) -> set[int]:
     counts = [Counter(side) for side in sides]
     common = set.intersection(*map(set, counts))
     return {n for n in common if min(side[n] for side in counts) >= FEWEST_SEEDS} or common
+
+
+def whole_seeds(numbers: Mapping[int, Collection[int]]) -> tuple[set[int], set[int]]:
+    """The seeds that were run at every one of some numbers of samples, and these numbers.
+
+    A seed that was run at the most alone would have wide ends, which say how it was planned and not
+    how soon it learns, and a mean over other seeds at each number is no curve. The numbers are the
+    :func:`well_filled` ones. Where too few seeds have them all, the numbers with the fewest seeds
+    are given up, the largest first of those with as many.
+
+    Args:
+        numbers: the numbers of real samples of each seed.
+
+    Examples:
+        >>> whole_seeds({0: [20, 1000], 1: [20, 1000], 2: [20, 1000], 3: [1000]})
+        ({0, 1, 2}, {1000, 20})
+    """
+    counts = Counter(n for found in numbers.values() for n in found)
+    wanted = well_filled(counts.elements())
+    enough = FEWEST_SEEDS if max(counts.values(), default=0) >= FEWEST_SEEDS else 1
+    while len(seeds := {s for s, found in numbers.items() if wanted <= {*found}}) < enough and (
+        len(wanted) > 1
+    ):
+        wanted.remove(min(wanted, key=lambda n: (counts[n], -n)))
+    return seeds, wanted
 
 
 def usual_samples(task: str, numbers: Iterable[int]) -> int:
@@ -126,10 +151,52 @@ class Results:
                     found.setdefault((run.samples, run.seed), Score(run, acting))
         return [found[key] for key in sorted(found)]
 
+    def preset(self, system: PaperSystem) -> str | None:
+        """The preset of a system's runs, ``"default"`` where it has none; ``None`` for several."""
+        methods = {method for method, _ in system.sources}
+        presets = {run.preset for run in self.runs if run.method in methods} or {"default"}
+        return presets.pop() if len(presets) == 1 else None
+
     def usual(self, system: PaperSystem, task: str) -> list[Score]:
         """The scores at the usual number of real samples, by seed."""
         scores = self.scores(system, task)
         return self.at(usual_samples(task, (score.run.samples for score in scores)), system, task)
+
+    def whole(self, system: PaperSystem, task: str) -> list[Score]:
+        """The scores of which a curve over real samples is made (:func:`whole_seeds`)."""
+        scores = self.scores(system, task)
+        numbers: dict[int, set[int]] = defaultdict(set)
+        for score in scores:
+            numbers[score.run.seed].add(score.run.samples)
+        seeds, wanted = whole_seeds(numbers)
+        return [s for s in scores if s.run.seed in seeds and s.run.samples in wanted]
+
+    def averaged(
+        self, system: PaperSystem, tasks: Sequence[str] = SIX_TASKS
+    ) -> list[list[Score]] | None:
+        """The usual scores on each of the tasks that an average is over.
+
+        Returns:
+            ``None`` if one was not run, or not with the same share of the published samples as the
+            others: such an average would be of no budget.
+        """
+        scores = [self.usual(system, task) for task in tasks]
+        if not all(scores):
+            return None
+        shares = {
+            of_task[0].run.samples / PUBLISHED_SAMPLES[task]
+            for task, of_task in zip(tasks, scores, strict=True)
+            if task in PUBLISHED_SAMPLES and has_share(of_task[0].run.method)
+        }
+        return scores if len(shares) < 2 else None
+
+    def unlike_usual(self, system: PaperSystem, task: str) -> str:
+        """What stands beside the usual scores: their real samples, if not the default preset's."""
+        for score in self.usual(system, task):
+            default = DEFAULT_SAMPLES.get(task)
+            if default not in (None, score.run.samples) and has_share(score.run.method):
+                return f"{score.run.samples} samples"
+        return ""
 
     def at(self, samples: int, system: PaperSystem, task: str) -> list[Score]:
         """The scores at a number of real samples, by seed."""

@@ -50,6 +50,7 @@ class Run:
         method: name of its method.
         task: name of its task, with the world's where it is not the simulated one.
         label: name of its settings.
+        preset: the preset that they begin with.
         samples: real samples it was given.
         seed: its seed.
         kind: kind of its model; ``None`` for a method without one.
@@ -71,6 +72,7 @@ class Run:
     method: str
     task: str
     label: str
+    preset: str
     samples: int
     seed: int
     kind: str | None
@@ -157,6 +159,7 @@ def read_run(folder: Path, *, any_version: bool = False) -> Run:
         # Published returns and bounds are of the simulated worlds.
         task=task if world == "simulated" else f"{task} in {world}",
         label=label,
+        preset=str(config.get("preset") or "default"),
         samples=int(cell.get("samples") or metadata["real_steps"]),
         seed=int(config["seed"]),
         kind=kind,

@@ -34,13 +34,19 @@ def soundness(runs: Iterable[Run]) -> Section:
         "Seeds of a cell should be of one configuration, of one commit in all their sessions, of "
         f"code without other changes, and from {REPORT_SEED} on, which no choice of a default has "
         "seen. "
-        + (f"That is not so in {len(rows)} of {len(by_cell)} cells." if rows else "That is so.")
+        + _verdict(len(rows), len(by_cell))
         + " Comparisons of cells with several configurations get no verdict."
     )
     header = ["cell, real samples", "runs", "configurations", "commits", "seeds of changed code"]
     header += ["seeds of code that may have been changed", f"seeds below {REPORT_SEED}"]
     tables = {"Cells": Table("soundness", header, rows)} if rows else {}
     return Section("Soundness", text, tables)
+
+
+def _verdict(bad: int, cells: int) -> str:
+    if not cells:
+        return "There are no runs."
+    return f"That is not so in {bad} of {cells} cells." if bad else "That is so."
 
 
 def _seeds(seeds: Sequence[int]) -> str:

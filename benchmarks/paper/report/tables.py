@@ -22,15 +22,18 @@ class Stat:
     Args:
         values: the values; of none, the cell is :data:`NOT_RUN`.
         digits: decimals to show.
+        note: what differs from other cells, such as ``"20 samples"``.
     """
 
     values: tuple[float, ...]
     digits: int = 1
+    note: str = ""
 
     def __str__(self) -> str:
         if not self.values:
             return NOT_RUN
-        return f"{mean_and_std(self.values, self.digits)} ({len(self.values)})"
+        seeds = f"{len(self.values)}; {self.note}" if self.note else f"{len(self.values)}"
+        return f"{mean_and_std(self.values, self.digits)} ({seeds})"
 
     def columns(self) -> dict[str, float | int | str]:
         """Columns of a CSV file, by what is added to the header."""
@@ -39,7 +42,8 @@ class Stat:
         mean = sum(self.values) / len(self.values)
         squares = sum((value - mean) ** 2 for value in self.values)
         std = math.sqrt(squares / (len(self.values) - 1)) if len(self.values) > 1 else math.nan
-        return {" mean": mean, " std": std, " seeds": len(self.values)}
+        noted: dict[str, float | int | str] = {" note": self.note} if self.note else {}
+        return {" mean": mean, " std": std, " seeds": len(self.values), **noted}
 
 
 @dataclass(frozen=True)

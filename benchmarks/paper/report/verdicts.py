@@ -50,7 +50,8 @@ class Finding:
         verdict: :data:`SHOWN`, :data:`NOT_SHOWN` or :data:`REFUTED`, or
             :data:`~report.cells.MIXED` where runs are compared that cannot be, or
             :data:`~report.tables.NOT_RUN` where a side was planned and has no run, or
-            :data:`NOT_MEASURED` where there are runs that do not say what is compared.
+            :data:`NOT_MEASURED` where there are runs that do not say what is compared, as those
+            with one number of real samples do not say how many are needed.
         effect: its size, in words.
         ends: what the effect lies between, where it is known by its ends alone.
         interval: its 95 % interval over training seeds, or over turns.

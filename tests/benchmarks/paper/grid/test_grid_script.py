@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def test_the_script_runs_a_grid_shows_it_and_skips_it(
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "results").rglob("*.json")}
     assert len(kept) == 2 * 4 + 1
     names = ["cartpole-default-n200-seed0", "pendulum-default-n80-seed0"]
-    planned = tmp_path / "results" / "runs" / "planned.json"
+    planned = tmp_path / "results" / "trials" / "planned.json"
     assert [*json.loads(planned.read_text())] == names
     run_script("run_grid", *arguments)
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "results").rglob("*.json")} == kept
@@ -59,14 +60,22 @@ def test_the_script_runs_a_grid_shows_it_and_skips_it(
     assert (planned.parent / "cartpole-default-n2500-seed0" / "failure.json").is_file()
 
 
+def test_trials_are_kept_apart_from_the_cells_of_the_proof(tmp_path: Path) -> None:
+    trial = GridConfig("phihp", "pendulum", 100)
+    proof = replace(trial, proof=True)
+    places = [config.files(tmp_path).results for config in (trial, proof)]
+    assert places == [tmp_path / "results/trials", tmp_path / "results/runs"]
+    assert replace(proof, results="here").files(tmp_path).results == tmp_path / "here"
+
+
 def test_a_grid_may_be_planned_before_it_is_run(
     run_script: Callable[..., None], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run_script("run_grid", "seed=4,5", "only_plan=true", "refresh=0", "allow_dirty=true")
     assert "2 cells: 2 waiting" in capsys.readouterr().out
-    planned = json.loads((tmp_path / "results" / "runs" / "planned.json").read_text())
+    planned = json.loads((tmp_path / "results" / "trials" / "planned.json").read_text())
     assert [cell["seed"] for cell in planned.values()] == [4, 5]
-    assert not list((tmp_path / "results" / "runs").glob("*/"))
+    assert not list((tmp_path / "results" / "trials").glob("*/"))
     assert not list((tmp_path / "outputs").rglob("config.yaml"))
 
 
@@ -103,7 +112,7 @@ def test_code_without_a_commit_is_refused_before_anything_is_planned(
 def test_an_earlier_plan_that_cannot_be_read_is_one_sentence_and_no_run(
     run_script: Callable[..., None], tmp_path: Path
 ) -> None:
-    planned = tmp_path / "results" / "runs" / "planned.json"
+    planned = tmp_path / "results" / "trials" / "planned.json"
     planned.parent.mkdir(parents=True)
     planned.write_text('["pendulum-default-n1000-seed0"]')
     with pytest.raises(SystemExit, match=r"^error: results: expected a description of each cell"):

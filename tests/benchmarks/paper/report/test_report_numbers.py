@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +23,15 @@ from report import (
     read_run,
     samples_to_90,
 )
+from report.ablation import ablation
 from report.aggregate import aggregates, profiles, score_matrix
 from report.curves import mean_over_tasks, sample_curves, update_curves
 from report.efficiency import learning_points, sample_efficiency
 from report.learning_curve import learning_curve
 from report.paper_systems import PHIHP, TD3, TD3_IM_PH, system
 from report.planner_and_actor import acting_section, returns_markdown, usual_groups
+from report.results import SIX_TASKS, Results
+from report.runs import Acting
 from report.time_to_return import seconds_to
 
 
@@ -257,6 +261,39 @@ def test_seconds_to_a_return(tmp_path: Path) -> None:
     last = read_run(make_run(tmp_path, seed=1, curve=curve[:1]))
     assert seconds_to(last, -200.0) == 30.0
     assert seconds_to(last, -100.0) == math.inf
+    plans = {"planner": Acting((-90.0,), {}), "actor": Acting((-300.0,), {})}
+    seconds = {**last.seconds, "calibrate": 5.0}
+    assert seconds_to(replace(last, acting=plans, seconds=seconds), -100.0) == 35.0
+
+
+def test_an_average_is_of_one_share_of_the_published_samples(tmp_path: Path) -> None:
+    for task, samples in DEFAULT_SAMPLES.items():
+        for seed in (0, 1, 2):
+            make_run(tmp_path / "half", "dd-phihp", task, seed, samples, kind="data_driven")
+    twin = system("dd-phihp")
+    found = results(tmp_path / "half").averaged(twin)
+    assert found is not None
+    assert [len(scores) for scores in found] == [3] * 6
+    assert results(tmp_path / "half").unlike_usual(twin, "pendulum") == ""
+    for seed in range(2, 7):  # pendulum is known best at 20 samples, though a half was run too
+        make_run(tmp_path / "few", "dd-phihp", "pendulum", seed, 20, kind="data_driven")
+    runs = [run for run in results(tmp_path / "half").runs if run.task != "pendulum"]
+    mixed = Results([*runs, *results(tmp_path / "few").runs])
+    assert mixed.averaged(twin) is None
+    assert score_matrix(mixed, twin, SIX_TASKS) is None
+    assert mixed.unlike_usual(twin, "pendulum") == "20 samples"
+    assert "(5; 20 samples)" in str(ablation(mixed).tables["By task"].markdown())
+
+
+def test_an_agent_of_which_the_actor_alone_was_evaluated_has_its_curve(tmp_path: Path) -> None:
+    """Whatever calibration chose for it at the end."""
+    found = []
+    for seed, acting in enumerate(({"planner": [9.0], "actor": [5.0]}, {"actor": [5.0]})):
+        curve = ((100, 0.0), (200, 5.0), (300, 5.0))
+        make_run(tmp_path, "td-mpc-star", seed=seed, samples=300, curve=curve, acting=acting)
+    for score in results(tmp_path).scores(system("td-mpc-star"), "pendulum"):
+        found.append(learning_points(score))
+    assert found == [[(100, 0.0), (200, 5.0), (300, 5.0)]] * 2
 
 
 def test_time_to_the_published_return_against_published_updates(tmp_path: Path) -> None:
@@ -285,7 +322,7 @@ def test_learning_curve(tmp_path: Path) -> None:
     axis = figure.axes[0]
     mean = axis.lines[2]
     assert mean.get_xdata().tolist() == [0, 100, 200]
-    assert mean.get_ydata().tolist() == [1.0, 2.0, 3.0]
+    assert mean.get_ydata().tolist() == [1.0, 2.0, 2.5]  # a return stays what it was
     assert axis.get_xscale() == "linear"
     wide = learning_curve({"a": [([10, 1000], [0, 1])], "b": [([], [])]})
     assert wide.axes[0].get_xscale() == "symlog"
@@ -297,8 +334,15 @@ def test_seeds_that_were_run_at_fewer_numbers_do_not_widen_the_samples(tmp_path:
     """Three seeds have a point at 100 samples; the fourth was run at 1000 alone."""
     for seed in (0, 1, 2, 3):
         make_run(tmp_path, seed=seed, samples=1000, acting={"planner": [-100.0]})
-    alone = sample_efficiency(results(tmp_path), system("phihp"), "pendulum")
+    assert sample_efficiency(results(tmp_path), system("phihp"), "pendulum") is None
     for seed in (0, 1, 2):
         make_run(tmp_path, seed=seed, samples=100, acting={"planner": [-101.0]})
         found = sample_efficiency(results(tmp_path), system("phihp"), "pendulum")
-    assert (str(alone), str(found)) == ("≤ 1000", "≤ 100")
+    assert str(found) == "≤ 100"
+    # What two of them were run with besides is no point of theirs, nor of the curve.
+    for seed in (0, 1):
+        make_run(tmp_path, seed=seed, samples=2000, acting={"planner": [-1.0]})
+    found = results(tmp_path)
+    assert str(sample_efficiency(found, system("phihp"), "pendulum")) == "≤ 100"
+    curves = sample_curves(found, [system("phihp")], "pendulum")["PhIHP"]
+    assert [list(samples) for samples, _ in curves] == [[100, 1000]] * 3

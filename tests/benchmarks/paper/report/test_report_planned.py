@@ -14,7 +14,7 @@ from grid.keep import keep_failure, keep_names
 from measures import holm
 from phihp_torchrl.config import ConfigError
 from report import Results, read_runs
-from report.claims import claims_section
+from report.claims import claims_section, hybrid_earns_more
 from report.planned import planned_section, read_planned, samples_of
 
 
@@ -101,6 +101,38 @@ def test_a_side_that_was_planned_and_is_missing_is_named(tmp_path: Path) -> None
         assert (verdict, n) == ("not run", "3 of 4, 0 of 3")
     text = claims_section(Results(read_runs(tmp_path).runs, read_planned(tmp_path))).text
     assert "not run in 1 of 1 comparisons (not run: pendulum)" in text
+
+
+def test_two_systems_with_samples_of_their_own_count_before_they_are_run(tmp_path: Path) -> None:
+    both = ("td-mpc-star", "ph-td-mpc-star")
+    plan(tmp_path, *(Cell(method, "pendulum", 100 + seed) for method in both for seed in range(3)))
+    tmp_path.mkdir(exist_ok=True)
+    planned = read_planned(tmp_path)
+    (finding,) = hybrid_earns_more(Results((), planned))
+    assert (finding.what, finding.verdict, finding.seeds) == (
+        "Ph-TD-MPC* on pendulum",
+        "not run",
+        "0 of 3, 0 of 3",
+    )
+    for method in both:
+        for seed in range(3):
+            acting = {"actor": [float(seed)]}
+            make_run(tmp_path, method, "pendulum", 100 + seed, 9000, acting=acting)
+    (finding,) = hybrid_earns_more(Results(read_runs(tmp_path).runs, planned))
+    assert (finding.what, finding.seeds) == ("Ph-TD-MPC* on pendulum, 9000 samples", "3, 3")
+
+
+def test_seeds_that_were_planned_at_one_number_are_not_missing_at_others(tmp_path: Path) -> None:
+    """Ten are planned at a half, five of them at a tenth too."""
+    half = seeds(count=10)
+    tenth = [Cell("phihp", "pendulum", cell.seed, 100) for cell in half[:5]]
+    theirs = seeds("td-mpc")
+    make_planned(tmp_path, *half, *tenth, *theirs)
+    for cell in theirs:
+        metrics = tmp_path / cell.name / "metrics.csv"
+        metrics.write_text(metrics.read_text() + "policy,0,100,1,1,-900.0\n")
+    plan(tmp_path, *half, *tenth, *theirs)
+    assert rows(tmp_path)["1, pendulum"][-1] == "5, 3"
 
 
 def test_systems_planned_at_different_samples_are_no_comparison(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from kept_runs import make, make_run, results, table, text
 from phihp_torchrl.config import METHODS, Method, register_method
 from report import NOT_RUN, Table, read_run, systems
 from report.ablation import ablation
+from report.efficiency import ONE_NUMBER
 from report.main_table import main_table
 from report.results import TASKS
 
@@ -56,7 +57,7 @@ def test_a_task_of_ones_own_is_in_the_tables_without_a_target(tmp_path: Path) ->
     assert made.problems == ()
     assert column(tmp_path, "main_return", "PhIHP mean")["my-task"] == "-3.5"
     assert column(tmp_path, "main_return", "PhIHP, published")["my-task"] == "–"
-    assert column(tmp_path, "main_samples", "PhIHP to")["my-task"] == "300.0"
+    assert column(tmp_path, "main_samples", "PhIHP to")["my-task"] == ONE_NUMBER
     assert column(tmp_path, "differences", "difference")["my-task, TD3"] != NOT_RUN
     assert column(tmp_path, "generalization", "return mean")["my-task, hybrid"] == "-3.5"
     own = {row["task"]: row for row in table(tmp_path, "time_to_return")}["my-task"]
@@ -64,7 +65,7 @@ def test_a_task_of_ones_own_is_in_the_tables_without_a_target(tmp_path: Path) ->
     # Returns without bounds are on no scale, and in no average.
     ablated = {row["task, system"]: row for row in table(tmp_path, "ablation")}["my-task, PhIHP"]
     assert ablated["normalised return mean"] == "–"
-    assert ablated["real samples to 90 % to"] == "300.0"
+    assert ablated["real samples to 90 % to"] == ONE_NUMBER
     assert "my-task" not in column(tmp_path, "aggregates_mean", "PhIHP")
     gains = {row["task"] for row in table(tmp_path, "planning_gain")}
     assert gains == {"pendulum", "my-task"}

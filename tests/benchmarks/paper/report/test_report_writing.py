@@ -10,6 +10,7 @@ import pytest
 from kept_runs import make, make_run, table, text
 from matplotlib.figure import Figure
 
+from measures import DEFAULT_SAMPLES
 from report import (
     NOT_RUN,
     Number,
@@ -30,8 +31,10 @@ def test_the_whole_report(tmp_path: Path) -> None:
     for seed in (0, 1):
         for task in ("pendulum", "pendulum-swingup", "cartpole", "cartpole-swingup", "acrobot",
                      "acrobot-swingup"):  # fmt: skip
-            make_run(runs, task=task, seed=seed, error=0.01, curve=((1000, -200.0 - seed),))
-            make_run(runs, "dd-cem", task, seed, acting={"planner": [-400.0 - seed]},
+            for share in (5, 1):
+                samples = DEFAULT_SAMPLES[task] // share
+                make_run(runs, task=task, seed=seed, samples=samples, error=0.01)
+            make_run(runs, "dd-cem", task, seed, samples, acting={"planner": [-400.0 - seed]},
                      kind="data_driven", error=0.1)  # fmt: skip
     make_run(runs, label="paper", seed=3)
     trials = [Trial("pendulum", 0, "planning_horizon", h, -180.0 - h, 1.0, 5, h) for h in (1, 4)]
@@ -64,7 +67,8 @@ def test_the_whole_report(tmp_path: Path) -> None:
     assert over["TD-MPC"]["mean"] == NOT_RUN
     assert 0 < float(over["dd-CEM"]["IQM"]) < float(over["PhIHP"]["IQM"]) < 1
     glance = {row["system"]: row for row in table(tmp_path, "at_a_glance")}
-    assert glance["PhIHP"]["real samples to 90 %"] == "≤ 1000"
+    assert glance["PhIHP"]["real samples to 90 %"] == "≤ 617"
+    assert glance["PhIHP"]["seeds"] == "2"
     assert float(glance["PhIHP"]["normalised return"]) == pytest.approx(
         float(over["PhIHP"]["mean"])
     )
