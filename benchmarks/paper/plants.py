@@ -118,7 +118,8 @@ def page(entries: Sequence[Mapping[str, Any]]) -> str:
                      share, "–" if chatter is None else f"{chatter:.3f}", acting])  # fmt: skip
     header = ["task", "plant", "seed", "return", "lost %", "chatter", "acting"]
     noise = "; ".join(f"{task}: {', '.join(words)}" for task, words in NOISE.items())
-    floors = "; ".join(f"{e['task']}: {e['floor']:.1f}" for e in entries if e["plant"] == AS_IT_IS)
+    of_tasks = {e["task"]: e["floor"] for e in entries if e["plant"] == AS_IT_IS}
+    floors = "; ".join(f"{task}: {floor:.1f}" for task, floor in of_tasks.items())
     commits = ", ".join(sorted({commit_text(e["origin"]) for e in entries}))
     machines = "; ".join(sorted({machine_text(e["origin"]) for e in entries}))
     return (

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +70,16 @@ def error(trainer: ModelTrainer, state: Tensor, action: Tensor, following: Tenso
 def measure(task: str, seed: int, restarts: int, states: tuple[Tensor, ...]) -> dict[str, Any]:
     """The errors of one seed, without restarts and with them."""
     once, best = (error(fitted(task, seed, count), *states) for count in (0, restarts))
-    return {"task": task, "seed": seed, "restarts": restarts, "once": once, "best": best}
+    found = {"task": task, "seed": seed, "restarts": restarts, "once": once, "best": best}
+    return found | {"origin": describe_origin(seed)}
+
+
+def kept_rows(results: Path, tasks: Sequence[str]) -> list[dict[str, Any]]:
+    """The rows of earlier measurements, but for those of tasks that are measured again."""
+    path = results / "restarts.json"
+    content = json.loads(path.read_text()) if path.is_file() else {"rows": []}
+    older = {"origin": content["origin"]} if "origin" in content else {}
+    return [older | row for row in content["rows"] if row["task"] not in tasks]
 
 
 def ratio(rows: list[dict[str, Any]]) -> tuple[float, float, float]:
@@ -82,13 +92,14 @@ def ratio(rows: list[dict[str, Any]]) -> tuple[float, float, float]:
     return math.exp(mean), math.exp(mean - half), math.exp(mean + half)
 
 
-def write_tables(content: dict[str, Any], results: Path) -> None:
+def write_tables(measured: Sequence[dict[str, Any]], results: Path) -> None:
     """Write what was measured, and the table of it."""
     results.mkdir(parents=True, exist_ok=True)
-    (results / "restarts.json").write_text(json.dumps(content, indent=1) + "\n")
+    content = json.dumps({"rows": measured}, indent=1)
+    (results / "restarts.json").write_text(content + "\n")
     rows = []
-    for task in sorted({row["task"] for row in content["rows"]}):
-        ours = [row for row in content["rows"] if row["task"] == task]
+    for task in sorted({row["task"] for row in measured}):
+        ours = [row for row in measured if row["task"] == task]
         mean, low, high = ratio(ours)
         once, best = (
             math.exp(sum(math.log(row[name]) for row in ours) / len(ours))
@@ -103,9 +114,9 @@ def write_tables(content: dict[str, Any], results: Path) -> None:
         "edit. Mean squares of one-step errors in units of one-step changes, at states of the "
         "shipped agent's real episodes and under random actions; geometric means over seeds, and "
         "of their ratios with the 95 % interval. Restarts: "
-        f"{content['rows'][0]['restarts']}.\n\n"
+        f"{', '.join(sorted({str(row['restarts']) for row in measured}))}.\n\n"
         + markdown_table(header, rows)
-        + f"\n{origin_text(content['origin'])}.\n"
+        + f"\n{'; '.join(sorted({origin_text(row['origin']) for row in measured}))}.\n"
     )
 
 
@@ -118,12 +129,12 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    rows = []
+    rows = kept_rows(arguments.results, arguments.tasks)
     for task in arguments.tasks:
         states = visited(task)
         for seed in arguments.seeds:
             rows.append(measure(task, seed, arguments.restarts, states))
-            write_tables({"rows": rows, "origin": describe_origin(seed)}, arguments.results)
+            write_tables(rows, arguments.results)
             print(rows[-1], flush=True)
 
 

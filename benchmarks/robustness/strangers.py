@@ -23,6 +23,8 @@ def main() -> None:
     done = subprocess.run([sys.executable, "-m", "pytest", *words], capture_output=True, text=True)
     counts = {word: int(n) for n, word in re.findall(r"(\d+) (passed|failed)", done.stdout)}
     passed, failed = counts.get("passed", 0), counts.get("failed", 0)
+    if done.returncode not in (0, 1) or not passed + failed:  # 1 is that of tests that failed
+        sys.exit(f"error: expected tests that run, got:\n{done.stdout[-2000:]}{done.stderr}")
     record = {"kinds": passed + failed, "executed": failed}
     write_part("strangers", record)
     print(record)

@@ -6,14 +6,14 @@ It writes ``phihp_torchrl/trainers/rates.json``: by method, preset, task and pha
 and 90th percentile over runs of the seconds for each unit of the setting that says how much work
 there is. Where several directories have runs of a method, preset and task, the last that is named
 decides: it has the newest. An evaluation's time is that of the usual number of episodes, which are
-played as a batch.
+played as a batch. Of runs with several numbers of real steps those with the most common one count.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 from statistics import median, quantiles
 from typing import Any
@@ -32,7 +32,7 @@ def main(places: list[str]) -> None:
     found: dict[str, dict[str, list[float]]] = {}
     about: dict[str, list[dict[str, Any]]] = {}
     for place in places:
-        here: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+        here: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(lambda: defaultdict(list))
         sessions: dict[str, list[dict[str, Any]]] = defaultdict(list)
         for path in sorted(Path(place).glob("*/metadata.json")):
             metadata = json.loads(path.read_text())
@@ -44,8 +44,10 @@ def main(places: list[str]) -> None:
             for phase, seconds in metadata["seconds"].items():
                 amount = config[phase][PER[phase]] if phase in PER else 1
                 if amount:
-                    here[key][phase].append(seconds / amount)
-        found |= here
+                    here[key][phase].append((amount, seconds / amount))
+        found |= {
+            key: {phase: _usual(values) for phase, values in of.items()} for key, of in here.items()
+        }
         about |= sessions
     used = [session for of in about.values() for session in of]
     versions = {session["versions"]["phihp_torchrl"] for session in used}
@@ -59,6 +61,12 @@ def main(places: list[str]) -> None:
         },
     }
     FILE.write_text(json.dumps(rates, indent=1) + "\n")
+
+
+def _usual(values: list[tuple[int, float]]) -> list[float]:
+    """Seconds for a unit, of the amount of work that most runs have: a unit of few takes longer."""
+    ((usual, _),) = Counter(amount for amount, _ in values).most_common(1)
+    return [seconds for amount, seconds in values if amount == usual]
 
 
 def _three(values: list[float]) -> list[float]:

@@ -7,10 +7,17 @@ import math
 import pytest
 
 from phihp_torchrl.origin import describe_origin
-from restarts import ratio, write_tables
+from restarts import kept_rows, ratio, write_tables
 
 ROWS = [
-    {"task": "cartpole-swingup", "seed": seed, "restarts": 2, "once": 0.04, "best": best}
+    {
+        "task": "cartpole-swingup",
+        "seed": seed,
+        "restarts": 2,
+        "once": 0.04,
+        "best": best,
+        "origin": describe_origin(seed),
+    }
     for seed, best in ((20, 0.01), (21, 0.02), (22, 0.04))
 ]
 
@@ -31,7 +38,9 @@ def test_one_seed_has_no_interval():
 
 
 def test_the_table_says_what_was_compared(tmp_path):
-    write_tables({"rows": ROWS, "origin": describe_origin(22)}, tmp_path)
+    write_tables(ROWS, tmp_path)
     page = (tmp_path / "README.md").read_text()
     assert "| cartpole-swingup | 250 | 20 to 22 | 0.04 | 0.02 | 0.50 (" in page
     assert "Restarts: 2." in page
+    assert kept_rows(tmp_path, ["pendulum"]) == ROWS
+    assert kept_rows(tmp_path, ["cartpole-swingup"]) == []
