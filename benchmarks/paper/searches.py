@@ -18,11 +18,12 @@ from typing import Any
 
 import torch
 
-from measures import paired_difference, study, train
+from measures import paired_difference
 from phihp_torchrl import load_config
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import origin_text
 from phihp_torchrl.trainers import PolicyTrainer, read_run_config
+from studies import study, train
 
 RESULTS = Path("results/searches")
 EPISODES = 32

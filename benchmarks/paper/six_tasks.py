@@ -22,9 +22,10 @@ from pathlib import Path
 from measures import DEFAULT_SAMPLES, agent_in, paired_difference_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, TARGETS, markdown_table
 from report.cells import configurations
-from report.overview import origins, put_between
+from report.overview import origins
 from report.runs import Run, read_runs
 from report.time_to_return import seconds_text
+from report.write import put_between
 
 RESULTS = Path("results/runs")
 START, END = "<!-- results:start -->", "<!-- results:end -->"

@@ -27,7 +27,7 @@ from phihp_torchrl.config import kind_mapping
 from phihp_torchrl.tasks import list_tasks, register_task
 from phihp_torchrl.trainers import RunDirectory, read_run_config
 from phihp_torchrl.worlds import EnvWorld, GivenConfig
-from report.overview import put_between
+from report.write import put_between
 from world_scores import brief, write_report
 
 RESULTS, RUNS = Path("results/worlds"), Path("outputs/worlds")

@@ -13,7 +13,6 @@ from measures.differences import (
     holm,
     paired_difference_of_seeds,
 )
-from measures.imagined import study, train
 from measures.paired import PairedDifference, paired_difference
 from measures.prediction import (
     PREDICTION_EPISODES,
@@ -49,8 +48,6 @@ __all__ = [
     "ratio_between",
     "ratio_interval",
     "read_curve",
-    "study",
-    "train",
     "unseen_episodes",
     "write_curve",
 ]

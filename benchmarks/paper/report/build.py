@@ -19,7 +19,8 @@ from report.generalization import generalization
 from report.main_table import main_table
 from report.over_runs import aggregate_section
 from report.overview import origins, overview
-from report.planned import planned_section, read_planned
+from report.planned import read_planned
+from report.planned_section import planned_section
 from report.planner_and_actor import acting_section
 from report.results import Results
 from report.runs import Run, read_runs
@@ -119,26 +120,25 @@ def make_report(config: ReportConfig) -> Report:
     every = read_planned(Path(config.runs))
     planned = every.of(config.label)
     results = Results(chosen, planned)
-    sections = [
-        _make("The paper's claims", lambda: claims_section(results, turns), problems),
-        _make("At a glance", lambda: at_a_glance(results, turns), problems),
-        _make("Planned and done", lambda: planned_section(every, folders.runs), problems),
-        _make("Soundness", lambda: soundness(chosen), problems),
-        _make("Main table", lambda: main_table(results), problems),
-        _make("Learning curves", lambda: learning_curves(results), problems),
-        _make("Performance over runs", lambda: aggregate_section(results, config.reps), problems),
-        _make("PhIHP against each baseline", lambda: significance(results), problems),
-        _make("Ablation", lambda: ablation(results), problems),
-        _make("Generalization", lambda: generalization(results), problems),
-        _make("TD3 in imagination", lambda: imagined_curves(results), problems),
-        _make("Sensitivity", lambda: sensitivity(trials), problems),
-        _make("PhIHP, planner and actor", lambda: acting_section(chosen, planned), problems),
-        _make(
-            "From nothing to the published return",
-            lambda: time_to_return(chosen, Path(config.benchmarks)),
-            problems,
+    makers: dict[str, Callable[[], Section]] = {
+        "The paper's claims": lambda: claims_section(results, turns),
+        "At a glance": lambda: at_a_glance(results, turns),
+        "Planned and done": lambda: planned_section(every, folders.runs),
+        "Soundness": lambda: soundness(chosen),
+        "Main table": lambda: main_table(results),
+        "Learning curves": lambda: learning_curves(results),
+        "Performance over runs": lambda: aggregate_section(results, config.reps),
+        "PhIHP against each baseline": lambda: significance(results),
+        "Ablation": lambda: ablation(results),
+        "Generalization": lambda: generalization(results),
+        "TD3 in imagination": lambda: imagined_curves(results),
+        "Sensitivity": lambda: sensitivity(trials),
+        "PhIHP, planner and actor": lambda: acting_section(chosen, planned),
+        "From nothing to the published return": lambda: time_to_return(
+            chosen, Path(config.benchmarks)
         ),
-    ]
+    }
+    sections = [_make(title, make, problems) for title, make in makers.items()]
     if problems:
         sections.append(_left_out(problems))
     introduction = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from itertools import product
+from typing import NamedTuple
 
 from measures import mean_between, ratio_between
 from phihp_torchrl.evaluation import PUBLISHED
@@ -61,6 +62,45 @@ _PAIRS = (
 )
 
 
+class Claim(NamedTuple):
+    """A claim of the paper, or of ours, as it is judged.
+
+    Attributes:
+        words: what is claimed.
+        findings: of its comparisons.
+        sides: the systems that they are of.
+    """
+
+    words: str
+    findings: Sequence[Finding]
+    sides: Sequence[Sequence[PaperSystem]] = ()
+
+
+def claims(results: Results, turns: Turns) -> list[Claim]:
+    """All claims, in their order."""
+    baselines = [(PHIHP, baseline) for baseline in systems("baseline")]
+    return [
+        Claim(
+            f"PhIHP needs at least {FEWER:.0f} times fewer real samples than TD-MPC",
+            fewer_samples(results),
+            [(PHIHP, TD_MPC)],
+        ),
+        Claim("PhIHP earns more than TD3", earns_more(results, PHIHP, TD3), [(PHIHP, TD3)]),
+        Claim("Planning improves on the policy", planning_improves(results), [(PHIHP,)]),
+        Claim(
+            "The hybrid model beats the data-driven one at equal samples",
+            hybrid_earns_more(results),
+            _PAIRS,
+        ),
+        Claim("PhIHP acts faster than TD-MPC", faster(turns, results.preset(PHIHP))),
+        Claim(
+            f"PhIHP earns as much as each baseline, to {EQUIVALENT:.0%} of a task's range",
+            not_worse(results),
+            baselines,
+        ),
+    ]
+
+
 def claims_section(results: Results, turns: Turns | None = None) -> Section:
     """A sentence for each claim, and a row for each comparison.
 
@@ -68,29 +108,10 @@ def claims_section(results: Results, turns: Turns | None = None) -> Section:
         results: the scores, and what was planned.
         turns: times of an action (:func:`~report.action_times.read_turns`).
     """
-    claims = {
-        f"PhIHP needs at least {FEWER:.0f} times fewer real samples than TD-MPC": fewer_samples(
-            results
-        ),
-        "PhIHP earns more than TD3": earns_more(results, PHIHP, TD3),
-        "Planning improves on the policy": planning_improves(results),
-        "The hybrid model beats the data-driven one at equal samples": hybrid_earns_more(results),
-        "PhIHP acts faster than TD-MPC": faster(turns or {}, results.preset(PHIHP)),
-        f"PhIHP earns as much as each baseline, to {EQUIVALENT:.0%} of a task's range": not_worse(
-            results
-        ),
-    }
-    sides = (
-        ((PHIHP, TD_MPC),),
-        ((PHIHP, TD3),),
-        ((PHIHP,),),
-        _PAIRS,
-        (),
-        [(PHIHP, baseline) for baseline in systems("baseline")],
-    )
+    judged = claims(results, turns or {})
     lines = [
-        f"- **{claim}**: {sentence(findings, done=_any_done(results, pairs))}"
-        for (claim, findings), pairs in zip(claims.items(), sides, strict=True)
+        f"- **{claim.words}**: {sentence(claim.findings, done=_any_done(results, claim.sides))}"
+        for claim in judged
     ]
     if published := _published_samples(results):
         lines.append(f"- {published}")
@@ -98,8 +119,8 @@ def claims_section(results: Results, turns: Turns | None = None) -> Section:
         lines.append(f"- {REDUCED}")
     rows: list[list[TableCell]] = [
         [f"{i}, {f.what}", f.verdict, f.effect, f.ends, f.interval, f.seeds]
-        for i, findings in enumerate(claims.values(), 1)
-        for f in findings
+        for i, claim in enumerate(judged, 1)
+        for f in claim.findings
     ]
     header = ["claim, comparison", "verdict", "effect", "lies between", "95 % interval"]
     header += ["seeds or turns"]

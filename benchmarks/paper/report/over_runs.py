@@ -104,7 +104,9 @@ def _profile_figure(matrices: Mapping[str, Mapping[str, NDArray[np.float64]]], r
     rows = -(-len(matrices) // columns)
     figure = Figure(figsize=(3.4 * columns, 2.8 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axis, (group, scores) in zip(axes, matrices.items(), strict=True):
+    for axis in axes[len(matrices) :]:
+        axis.set_axis_off()
+    for axis, (group, scores) in zip(axes, matrices.items(), strict=False):
         for name, (middle, low, high) in profiles(scores, _THRESHOLDS, reps).items():
             axis.plot(_THRESHOLDS, middle, color=_color(name), label=name)
             axis.fill_between(_THRESHOLDS, low, high, color=_color(name), alpha=0.2, linewidth=0)

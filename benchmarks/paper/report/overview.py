@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from report.planned import Planned
 from report.planner_and_actor import acting_section, returns_markdown
@@ -44,9 +43,11 @@ def origins(runs: Sequence[Run]) -> str:
     seeds = ", ".join(str(seed) for seed in sorted({run.seed for run in runs}))
     commits = ", ".join(sorted({run.commit for run in runs}))
     machines = "; ".join(sorted({run.machine for run in runs}))
+    counts = " or ".join(str(count) for count in sorted({run.threads for run in runs}))
+    threads = "one thread" if counts == "1" else f"{counts} threads"
     return (
-        f"Seeds: {seeds}. Commits: {commits}. Machine: {machines}, shared with other work; one "
-        "thread a run, so times are upper bounds."
+        f"Seeds: {seeds}. Commits: {commits}. Machine: {machines}, shared with other work; "
+        f"{threads} a run, so times are upper bounds."
     )
 
 
@@ -54,13 +55,3 @@ def _episodes(runs: Sequence[Run]) -> str:
     """How many episodes an evaluation had; several numbers if it was not the same everywhere."""
     counts = {len(acting.returns) for run in runs for acting in run.acting.values()}
     return " or ".join(str(count) for count in sorted(counts))
-
-
-def put_between(page: Path, start: str, end: str, text: str) -> bool:
-    """Put a text between two markers of a page; whether it has them."""
-    old = page.read_text() if page.is_file() else ""
-    if start not in old or end not in old.split(start)[1]:
-        return False
-    before, rest = old.split(start, 1)
-    page.write_text(f"{before}{start}\n{text}\n{end}{rest.split(end, 1)[1]}")
-    return True

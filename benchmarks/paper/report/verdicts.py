@@ -85,8 +85,8 @@ def of_differences(pairs: Sequence[Pair]) -> list[Finding]:
         within = margin(pair.task)
         if verdict == NOT_SHOWN and within is not None and gap.within(within):
             effect += ", equivalent"
-        ends = "–" if math.isnan(gap.low) else f"{_text(gap.low)} to {_text(gap.high)}"
-        findings.append(Finding(pair.what, verdict, effect, "–", ends, pair.seeds))
+        interval = "–" if math.isnan(gap.low) else f"{_text(gap.low)} to {_text(gap.high)}"
+        findings.append(Finding(pair.what, verdict, effect, "–", interval, pair.seeds))
     return findings
 
 

@@ -49,6 +49,16 @@ def write_report(
     (directory / "README.md").write_text("\n".join(pages))
 
 
+def put_between(page: Path, start: str, end: str, text: str) -> bool:
+    """Put a text between two markers of a page; whether it has them."""
+    old = page.read_text() if page.is_file() else ""
+    if start not in old or end not in old.split(start)[1]:
+        return False
+    before, rest = old.split(start, 1)
+    page.write_text(f"{before}{start}\n{text}\n{end}{rest.split(end, 1)[1]}")
+    return True
+
+
 def _draw(picture: Picture, directory: Path) -> None:
     path = directory / f"{picture.name}.svg"
     # Random names of elements and the date would make each file a new one.

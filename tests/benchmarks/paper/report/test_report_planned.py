@@ -15,7 +15,8 @@ from measures import holm
 from phihp_torchrl.config import ConfigError
 from report import Results, read_runs
 from report.claims import claims_section, hybrid_earns_more
-from report.planned import planned_section, read_planned, samples_of
+from report.planned import read_planned, samples_of
+from report.planned_section import planned_section
 
 
 def make_planned(runs: Path, *cells: Cell) -> None:

@@ -19,9 +19,8 @@ from report import (
     Trial,
     write_trials,
 )
-from report.overview import put_between
 from report.sections import Picture, Section
-from report.write import write_report
+from report.write import put_between, write_report
 
 
 def test_the_whole_report(tmp_path: Path) -> None:

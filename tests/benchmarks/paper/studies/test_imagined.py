@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from measures import study, train
 from phihp_torchrl.planners import CEMConfig
 from phihp_torchrl.trainers import PolicyTrainer
+from studies import study, train
 
 TINY = ["policy.updates=8", "policy.random_steps=64", "policy.num_worlds=8", "policy.batch_size=8",
         "policy.evaluation_interval=8", "policy.evaluation_episodes=2", "policy.planned=0",
