@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from scipy import stats
 
+from measures import mean_and_half
 from phihp_torchrl import get_task, load_agent, load_config, make_world
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
@@ -174,20 +174,11 @@ def _row(task: str, method: str, runs: Sequence[dict[str, Any]], level: float) -
         str(len(runs)),
         f"{cost:.1f}",
         f"{statistics.median(point['updates'] for point in last):.0f}",
-        interval([best(run)["imagined"] for run in runs]),
-        interval([best(run)["real"] for run in runs]),
+        mean_and_half([best(run)["imagined"] for run in runs]),
+        mean_and_half([best(run)["real"] for run in runs]),
         f"{statistics.median(times):.0f} ({len(times)} of {len(runs)})" if times else "none",
         f"{100 * statistics.mean(limited):.1f} %" if limited else "",
     ]
-
-
-def interval(values: Sequence[float]) -> str:
-    """Mean ± half of Student's 95 % interval."""
-    mean = statistics.mean(values)
-    if len(values) < 2:
-        return f"{mean:.1f} one seed".replace("-", "−")
-    half = stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
-    return f"{mean:.1f} ± {half:.1f}".replace("-", "−")
 
 
 def main(run: Callable[..., dict[str, Any]] = train) -> None:

@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 
+from measures import last_metrics
 from phihp_torchrl import learn
 from phihp_torchrl.evaluation import BASELINES_KEY, controllers_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
@@ -49,14 +50,6 @@ SETTINGS = {
 _LOGGED = ("model/held_out_error", "model/rollout_error_20", "policy/imagined_return")
 
 
-def last_metrics(path: Path) -> dict[str, float]:
-    """The last value of each of the metrics that the page shows."""
-    found: dict[str, float] = {}
-    for row in csv.DictReader(path.read_text().splitlines()):
-        found |= {name: float(row[name]) for name in _LOGGED if row.get(name)}
-    return found
-
-
 def train(seed: int, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Learn the crane, and return what its evaluation says, by controller."""
     begun = time.perf_counter()
@@ -64,7 +57,8 @@ def train(seed: int, settings: Mapping[str, Any]) -> dict[str, Any]:
         overrides = {**settings, "seed": seed, "plugins": [str(RIG)]}
         path = learn("heavy-crane", overrides=overrides, run_dir=f"{place}/run").path
         played = json.loads((path / "evaluation.json").read_text())
-        metrics = last_metrics(path / "metrics.csv")
+        rows = csv.DictReader((path / "metrics.csv").read_text().splitlines())
+        metrics = last_metrics(rows, _LOGGED)
     beside = played.pop(BASELINES_KEY, {})
     return {
         "seed": seed,

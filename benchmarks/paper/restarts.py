@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from scipy import stats
 from torch import Tensor
 
-from measures import DEFAULT_SAMPLES
+from measures import DEFAULT_SAMPLES, mean_of_seeds
 from phihp_torchrl import load_agent, load_config
 from phihp_torchrl.evaluation import TARGETS, markdown_table
 from phihp_torchrl.origin import describe_origin, origin_text
@@ -84,12 +83,9 @@ def kept_rows(results: Path, tasks: Sequence[str]) -> list[dict[str, Any]]:
 
 def ratio(rows: list[dict[str, Any]]) -> tuple[float, float, float]:
     """Geometric mean over seeds of the errors' ratios, and its 95 % interval (Student's t)."""
-    logs = [math.log(row["best"] / row["once"]) for row in rows]
-    mean = sum(logs) / len(logs)
-    if len(logs) < 2:
-        return math.exp(mean), math.nan, math.nan
-    half = float(stats.t.ppf(0.975, len(logs) - 1) * stats.sem(logs))
-    return math.exp(mean), math.exp(mean - half), math.exp(mean + half)
+    found = mean_of_seeds([math.log(row["best"] / row["once"]) for row in rows])
+    assert found is not None  # of rows that there are
+    return math.exp(found.mean), math.exp(found.low), math.exp(found.high)
 
 
 def write_tables(measured: Sequence[dict[str, Any]], results: Path) -> None:

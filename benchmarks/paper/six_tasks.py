@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from measures import DEFAULT_SAMPLES, agent_in, paired_difference_of_seeds
+from measures import DEFAULT_SAMPLES, agent_in, mean_of_seeds
 from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, TARGETS, markdown_table
 from report.cells import configurations
 from report.overview import origins
@@ -57,7 +57,7 @@ def times(runs: Sequence[Run], level: float) -> str:
 
 def spread(values: Sequence[float], digits: int) -> str:
     """A mean over seeds with the 95 % interval of Student's t, where there are two or more."""
-    found = paired_difference_of_seeds(values)
+    found = mean_of_seeds(values)
     if found is None:
         return "–"
     if math.isnan(found.low):

@@ -24,9 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
-from measures import DEFAULT_SAMPLES
+from measures import DEFAULT_SAMPLES, last_metrics, mean_and_half
 from phihp_torchrl import learn, load_config
 from phihp_torchrl.evaluation import markdown_table
 from phihp_torchrl.origin import commit_text, describe_origin, machine_text
@@ -75,6 +74,9 @@ def settings(
     ]
 
 
+_LOGGED = ("model/held_out_error", "model/rollout_error_20", "policy/best_imagined_return")
+
+
 def train(task: str, variant: str, seed: int, lines: Sequence[str]) -> dict[str, Any]:
     """One run, from the first real step to the returns of evaluation."""
     begun = time.monotonic()
@@ -92,19 +94,12 @@ def train(task: str, variant: str, seed: int, lines: Sequence[str]) -> dict[str,
         "real_steps": metadata["real_steps"],
         "acting": acting,
         "returns": {"planner": returns[acting]["returns"], "actor": returns["actor"]["returns"]},
-        "metrics": _last_metrics(rows),
+        "metrics": last_metrics(rows, _LOGGED),
         "cost": cost(rows),
         "seconds": metadata["seconds"],
         "wall_seconds": round(time.monotonic() - begun, 1),
         "origin": describe_origin(seed),
     }
-
-
-def _last_metrics(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
-    """The last value of what the model and the policy say of themselves."""
-    names = ("model/held_out_error", "model/rollout_error_20", "policy/best_imagined_return")
-    values = {name: [row[name] for row in rows if row.get(name)] for name in names}
-    return {name: float(column[-1]) for name, column in values.items() if column}
 
 
 def cost(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
@@ -121,15 +116,6 @@ def cost(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
     pairs = zip(points[1:], points[:-1], strict=True)
     each = [(after[0] - before[0]) / (after[1] - before[1]) for after, before in pairs]
     return {"fits": fits, **({"update": float(np.median(each))} if each else {})}
-
-
-def interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean over training seeds and half its 95 % interval by Student's t; NaN for a single seed."""
-    mean = float(np.mean(values))
-    if len(values) < 2:
-        return mean, float("nan")
-    width = stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
-    return mean, float(width)
 
 
 def gains(runs: Sequence[Mapping[str, Any]], player: str) -> list[list[str]]:
@@ -153,8 +139,8 @@ def gains(runs: Sequence[Mapping[str, Any]], player: str) -> list[list[str]]:
                     str(mine[seeds[0]]["real_steps"]),
                     str(_value_of(mine[seeds[0]], "policy.updates")),
                     "narrow" if set(NARROW) <= set(mine[seeds[0]]["settings"]) else "default",
-                    _with_interval(*interval(list(means.values()))),
-                    "" if variant == PLAIN or not gain else _with_interval(*interval(gain)),
+                    mean_and_half(list(means.values())),
+                    "" if variant == PLAIN or not gain else mean_and_half(gain),
                     *(_times(mine, plain, part) for part in ("fits", "update")),
                 ]
             )
@@ -175,11 +161,6 @@ def _times(
 
 def _value_of(run: Mapping[str, Any], key: str) -> str:
     return next(line.split("=", 1)[1] for line in run["settings"] if line.startswith(f"{key}="))
-
-
-def _with_interval(mean: float, width: float) -> str:
-    spread = "one seed" if np.isnan(width) else f"± {width:.1f}"
-    return f"{mean:.1f} {spread}".replace("-", "−")
 
 
 def write_tables(results: Path) -> None:

@@ -16,11 +16,12 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from measures import last_metrics
 from other_worlds import WORLDS
 from phihp_torchrl import load_config, run
 from phihp_torchrl.config import kind_mapping
@@ -86,6 +87,9 @@ def train(name: str, seed: int, path: Path, changes: Sequence[str] = ()) -> dict
     return result(name, seed, lines, made.path) if made.finished else None
 
 
+_LOGGED = ("model/held_out_error", "policy/best_imagined_return", "policy/at_floor")
+
+
 def result(name: str, seed: int, lines: Sequence[str], path: Path) -> dict[str, Any]:
     """What the files of a finished run say."""
     entry = ENTRIES[name]
@@ -103,17 +107,10 @@ def result(name: str, seed: int, lines: Sequence[str], path: Path) -> dict[str, 
         "returns": {who: found["returns"] for who, found in played.items()},
         "target": entry.target,
         "policy": metadata.get("policy", {}),
-        "metrics": last_metrics(rows),
+        "metrics": last_metrics(rows, _LOGGED),
         "seconds": metadata["seconds"],
         "origin": metadata["sessions"][0],
     }
-
-
-def last_metrics(rows: Sequence[Mapping[str, str]]) -> dict[str, float]:
-    """The last value of what the model and the policy say of themselves."""
-    names = ("model/held_out_error", "policy/best_imagined_return", "policy/at_floor")
-    values = {name: [row[name] for row in rows if row.get(name)] for name in names}
-    return {name: float(column[-1]) for name, column in values.items() if column}
 
 
 def main() -> None:

@@ -5,13 +5,20 @@ from __future__ import annotations
 from measures.acting import agent_in
 from measures.censored import RESAMPLES, Between, mean_between, ratio_between, ratio_interval
 from measures.configuration import configuration_hash
-from measures.curve import CurvePoint, curve_from_metrics, read_curve, write_curve
+from measures.curve import (
+    CurvePoint,
+    curve_from_metrics,
+    last_metrics,
+    read_curve,
+    write_curve,
+)
 from measures.differences import (
     FEWEST_SEEDS,
     Difference,
     difference,
     holm,
-    paired_difference_of_seeds,
+    mean_and_half,
+    mean_of_seeds,
 )
 from measures.paired import PairedDifference, paired_difference
 from measures.prediction import (
@@ -41,9 +48,11 @@ __all__ = [
     "curve_from_metrics",
     "difference",
     "holm",
+    "last_metrics",
+    "mean_and_half",
     "mean_between",
+    "mean_of_seeds",
     "paired_difference",
-    "paired_difference_of_seeds",
     "prediction_errors",
     "ratio_between",
     "ratio_interval",

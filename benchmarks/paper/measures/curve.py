@@ -49,6 +49,20 @@ class CurvePoint:
     imagined_steps: float = math.nan
 
 
+def last_metrics(rows: Iterable[Mapping[str, str]], names: Iterable[str]) -> dict[str, float]:
+    """The last value of each of these metrics in the rows of a run's ``metrics.csv``.
+
+    Examples:
+        >>> last_metrics([{"a": "1", "b": "2"}, {"a": "3", "b": ""}], ["a", "b", "c"])
+        {'a': 3.0, 'b': 2.0}
+    """
+    found: dict[str, float] = {}
+    names = tuple(names)
+    for row in rows:
+        found |= {name: float(row[name]) for name in names if row.get(name)}
+    return found
+
+
 def curve_from_metrics(rows: Iterable[Mapping[str, str]]) -> list[CurvePoint]:
     """The curve in the rows of a run's ``metrics.csv``.
 

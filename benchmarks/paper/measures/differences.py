@@ -91,17 +91,17 @@ def difference(
     return Difference(mean, float(low), float(high), p, seeds)
 
 
-def paired_difference_of_seeds(values: Sequence[float], level: float = 0.95) -> Difference | None:
-    """Mean of paired differences, one for each training seed, by Student's t.
+def mean_of_seeds(values: Sequence[float], level: float = 0.95) -> Difference | None:
+    """Mean over training seeds with its interval by Student's t, such as of paired differences.
 
     Episodes of one seed share their agent, so that a seed counts once, however many they are.
 
     Args:
-        values: the mean difference of each seed.
+        values: the mean of each seed, or its mean difference, of which the p-value is.
         level: of the interval.
 
     Examples:
-        >>> found = paired_difference_of_seeds([1.0, 2.0, 3.0])
+        >>> found = mean_of_seeds([1.0, 2.0, 3.0])
         >>> f"{found.mean} [{found.low:.2f}, {found.high:.2f}], p = {found.p:.2f}"
         '2.0 [-0.48, 4.48], p = 0.07'
     """
@@ -114,6 +114,21 @@ def paired_difference_of_seeds(values: Sequence[float], level: float = 0.95) -> 
     low, high = test.confidence_interval(level)
     p = float(test.pvalue) if len(values) >= FEWEST_SEEDS else math.nan
     return Difference(mean, float(low), float(high), p, seeds)
+
+
+def mean_and_half(values: Sequence[float]) -> str:
+    """The same in words: the mean ± half of the interval.
+
+    Examples:
+        >>> mean_and_half([1.0, 2.0, 3.0]), mean_and_half([-1.0])
+        ('2.0 ± 2.5', '−1.0 one seed')
+    """
+    found = mean_of_seeds(values)
+    if found is None:
+        return "–"
+    half = (found.high - found.low) / 2
+    spread = "one seed" if len(values) < 2 else f"± {0.0 if math.isnan(half) else half:.1f}"
+    return f"{found.mean:.1f} {spread}".replace("-", "−")
 
 
 def holm(p_values: Sequence[float], family: int = 0) -> list[float]:

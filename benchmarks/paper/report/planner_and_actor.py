@@ -12,7 +12,7 @@ from measures import (
     Difference,
     agent_in,
     holm,
-    paired_difference_of_seeds,
+    mean_of_seeds,
 )
 from phihp_torchrl.evaluation import TARGETS, TaskResult, returns_table
 from report.comparison import numbers, unless_mixed
@@ -79,7 +79,7 @@ def planning_gain(group: Sequence[Run]) -> Difference:
     A seed whose calibration lets the actor act gains exactly nothing, and counts as any other.
     """
     agent, actor = (means(group, way) for way in _WAYS)
-    found = paired_difference_of_seeds([a - b for a, b in zip(agent, actor, strict=True)])
+    found = mean_of_seeds([a - b for a, b in zip(agent, actor, strict=True)])
     assert found is not None  # a group has runs
     return unless_mixed(found, group)
 

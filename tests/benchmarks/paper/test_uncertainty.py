@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 
 import pytest
 
 from phihp_torchrl import load_config
 from phihp_torchrl.trainers import read_run_config
-from uncertainty import NARROW, RESULTS, VARIANTS, cost, gains, interval, settings, write_tables
+from uncertainty import NARROW, RESULTS, VARIANTS, cost, gains, settings, write_tables
 
 ORIGIN = {
     "commit": "5e6e490c0ffee",
@@ -56,13 +55,6 @@ def test_narrow_networks_are_settings_that_the_table_names():
     assert (td3.actor_hidden_sizes, td3.critic_hidden_sizes) == ((128, 128), (128, 128, 128))
     (row,) = gains([made("plain", 100, [1.0]) | {"settings": lines}], "planner")
     assert row[5] == "narrow"
-
-
-def test_an_interval_is_students_over_seeds():
-    mean, half = interval([1.0, 2.0, 3.0])
-    assert mean == 2.0
-    assert half == pytest.approx(4.303 / math.sqrt(3), rel=1e-3)
-    assert math.isnan(interval([1.0])[1])
 
 
 def test_a_gain_is_taken_seed_by_seed():
