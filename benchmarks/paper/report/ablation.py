@@ -14,7 +14,7 @@ from report.efficiency import sample_efficiency, samples_cell
 from report.paper_systems import PaperSystem, systems
 from report.results import SIX_TASKS, Results, Score
 from report.sections import Picture, Section
-from report.tables import Stat, Table, TableCell
+from report.tables import NOT_RUN, Stat, Table, TableCell
 
 SAMPLES = "real samples to 90 %"
 
@@ -53,7 +53,8 @@ def ablation(results: Results) -> Section:
         for name, axis in axes.items():
             ends = _bar(results, system, common, metrics.get(name))
             if ends is None:
-                axis.text(x, 0.05, "not run", rotation=90, ha="center", va="bottom",
+                absent = "not known" if system in run else NOT_RUN
+                axis.text(x, 0.05, absent, rotation=90, ha="center", va="bottom",
                           transform=axis.get_xaxis_transform())  # fmt: skip
             else:
                 axis.bar(x, ends.high - ends.low, bottom=ends.low, color=f"C{x}")
@@ -61,6 +62,7 @@ def ablation(results: Results) -> Section:
         names = [system.name for system in compared]
         axis.set_xticks(range(len(names)), names, rotation=30, fontsize="small")
         axis.set_xlim(-0.6, len(names) - 0.4)
+        axis.set_ylim(bottom=min(0.0, axis.get_ylim()[0]))
         axis.set_title(name)
         axis.grid(axis="y", alpha=0.3)
     return Section(

@@ -46,6 +46,7 @@ def learning_curves(results: Results) -> Section:
     right = 1.3 * max((max(x) for x in samples), default=10_000)
     for panel in (*figure.axes, *figure_by_task.axes):
         panel.set_xscale("symlog", linthresh=1000)
+        panel.set_xticks([0, 1_000, 10_000, 100_000])
         panel.set_xlim(0, right)
     return Section(
         "Learning curves",
@@ -137,9 +138,11 @@ def _panels(
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(3.4 * columns, 2.8 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    drawn = [system.name for system in systems() if any(system.name in p for p in panels.values())]
     for axis, (task, curves) in zip(axes, panels.items(), strict=False):
         level = (published or {}).get(task)
-        draw_learning_curves(axis, curves, {} if level is None else {"PhIHP, published": level})
+        levels = {} if level is None else {"PhIHP, published": level}
+        draw_learning_curves(axis, curves, levels, drawn)
         axis.set(xlabel=xlabel, ylabel="return", title=task)
         if not curves:
             axis.text(0.5, 0.5, "not run", ha="center", va="center", transform=axis.transAxes)

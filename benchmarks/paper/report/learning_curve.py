@@ -54,11 +54,20 @@ def draw_learning_curves(
     axis: Axes,
     curves: Mapping[str, Sequence[tuple[ArrayLike, ArrayLike]]],
     reference: Mapping[str, float] | None = None,
+    methods: Sequence[str] = (),
 ) -> None:
-    """What :func:`learning_curve` draws, on an axis of a larger figure; a lone point is a dot."""
+    """What :func:`learning_curve` draws, on an axis of a larger figure; a lone point is a dot.
+
+    Args:
+        axis: where to draw.
+        curves: as there.
+        reference: as there.
+        methods: all that the figure has, so that each has one colour in it; by default, these.
+    """
     largest, smallest = 0.0, math.inf
-    for i, (method, seeds) in enumerate(curves.items()):
-        color = f"C{i % 10}"
+    order = methods or [*curves]
+    for method, seeds in curves.items():
+        color = f"C{order.index(method) % 10}"
         runs = [(np.asarray(x, dtype=float), np.asarray(y, dtype=float)) for x, y in seeds]
         runs = [(x, y) for x, y in runs if len(x)]
         for x, y in runs:
