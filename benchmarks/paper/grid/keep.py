@@ -19,6 +19,7 @@ from grid.cell import Cell, CellFiles
 from grid.claim import claim
 from grid.planned import read_cells
 from measures import configuration_hash, curve_from_metrics, prediction_errors, write_curve
+from phihp_torchrl.config import ConfigError
 from phihp_torchrl.deployment import Agent, load_agent
 from phihp_torchrl.evaluation import PROOF_SEED
 from phihp_torchrl.trainers import write_atomically
@@ -67,19 +68,29 @@ def keep_failure(files: CellFiles, record: Mapping[str, Any]) -> None:
     write_atomically(files.kept_failure, json.dumps(short, indent=2) + "\n")
 
 
+_WAIT = 60.0
+"""Seconds for other processes to write their plan."""
+
+
 def keep_names(cells: Sequence[CellFiles]) -> None:
     """Add the cells that a grid was asked for to ``planned.json``, by their names.
 
     With it a report can say how many of the planned cells there are, and which are missing.
 
     Raises:
-        ConfigError: for an earlier ``planned.json`` that cannot be read.
+        ConfigError: for an earlier ``planned.json`` that cannot be read, or that other processes
+            write for a minute.
     """
-    named = defaultdict[tuple[Path, Path], dict[str, Cell]](dict)
+    named = defaultdict[Path, dict[str, Cell]](dict)
     for files in cells:
-        named[files.planned, files.runs][files.cell.name] = files.cell
-    for (planned, runs), asked in named.items():
-        with claim(runs / f"{planned.name}.lock", wait=60.0):
+        named[files.planned][files.cell.name] = files.cell
+    for planned, asked in named.items():
+        # Beside the file, which grids of several clones may share.
+        with claim(planned.with_name(f".{planned.name}.lock"), wait=_WAIT) as ours:
+            if not ours:
+                raise ConfigError(
+                    "results", f"expected to write {planned}, another process holds its lock."
+                )
             before = read_cells(planned, "results")
             if asked.keys() <= before.keys():
                 continue

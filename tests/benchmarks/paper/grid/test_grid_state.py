@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from grid_cells import YAML
 
 from grid import Cell, CellFiles, GridConfig, LiveTable, Status, look, swept_cells
+from grid.claim import claim
 from grid.display import summary, table
 from grid.keep import keep_names
 from phihp_torchrl.config import ConfigError
@@ -67,6 +69,18 @@ def test_an_earlier_plan_that_cannot_be_read_is_kept_and_named(
     with pytest.raises(ConfigError, match=r"^results: expected a description of each cell in"):
         keep_names([config.files(Path())])
     assert planned.read_text() == torn
+
+
+def test_a_plan_that_another_process_writes_is_not_written_over(
+    config: GridConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.modules["grid.keep"], "_WAIT", 0.0)  # `grid.keep` is a function
+    planned = config.files(Path()).planned
+    with claim(planned.with_name(".planned.json.lock")) as ours:
+        assert ours
+        with pytest.raises(ConfigError, match=r"^results: expected to write .*planned\.json"):
+            keep_names([config.files(Path())])
+    assert not planned.exists()
 
 
 def test_workers_get_a_table_that_shows_nothing() -> None:
