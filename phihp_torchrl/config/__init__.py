@@ -25,10 +25,6 @@ from phihp_torchrl.config.compose import (
     compose_yaml,
     finish,
     load_config,
-    open_mappings,
-    override_key,
-    override_lines,
-    parse_overrides,
 )
 from phihp_torchrl.config.convert import INFINITE, check_fields, plain, plain_fields
 from phihp_torchrl.config.durations import (
@@ -47,6 +43,12 @@ from phihp_torchrl.config.errors import ConfigError, meant
 from phihp_torchrl.config.help import help_text, sentences, sentences_of, settings_text
 from phihp_torchrl.config.methods import METHODS, Method, get_method, register_method
 from phihp_torchrl.config.modules import import_named
+from phihp_torchrl.config.overrides import (
+    open_mappings,
+    override_key,
+    override_lines,
+    parse_overrides,
+)
 from phihp_torchrl.config.own_key import STATE_VARIABLE, is_own_signature, own_signature
 from phihp_torchrl.config.registry import Registry
 from phihp_torchrl.config.seals import (
