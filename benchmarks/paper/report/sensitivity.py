@@ -71,9 +71,9 @@ def read_trials(directory: Path) -> tuple[list[Trial], list[str]]:
 
 def sensitivity(trials: Sequence[Trial]) -> Section:
     """Curves of return and time, one column for each setting."""
-    groups: dict[tuple[str, str], list[Trial]] = defaultdict(list)
+    groups: dict[tuple[str, int, str], list[Trial]] = defaultdict(list)
     for trial in trials:
-        groups[trial.task, trial.setting].append(trial)
+        groups[trial.task, trial.seed, trial.setting].append(trial)
     rows: list[list[TableCell]] = []
     for t in trials:
         numbers = [Number(x, 1, fixed=True) for x in (t.return_mean, t.return_std)]
@@ -81,24 +81,26 @@ def sensitivity(trials: Sequence[Trial]) -> Section:
         rows.append([t.task, str(t.seed), SYMBOLS[t.setting], str(t.value), *numbers])
     figure = Figure(figsize=(3.2 * len(SYMBOLS), 5.4), layout="constrained")
     axes = figure.subplots(2, len(SYMBOLS), sharex="col")
-    tasks = list(dict.fromkeys(trial.task for trial in trials))
+    agents = list(dict.fromkeys((trial.task, trial.seed) for trial in trials))
+    several = len(agents) > len({task for task, _ in agents})
     for column, (setting, symbol) in enumerate(SYMBOLS.items()):
-        for i, task in enumerate(tasks):
-            found = sorted(groups[task, setting], key=lambda trial: trial.value)
+        for i, (task, seed) in enumerate(agents):
+            found = sorted(groups[task, seed, setting], key=lambda trial: trial.value)
+            label = f"{task}, {seed}" if several else task
             values = [trial.value for trial in found]
             best = max((abs(trial.return_mean) for trial in found), default=0.0) or 1.0
             returns = [trial.return_mean / best for trial in found]
-            axes[0, column].plot(values, returns, "o-", color=f"C{i}", label=task, markersize=3)
+            axes[0, column].plot(values, returns, "o-", color=f"C{i}", label=label, markersize=3)
             times = [trial.milliseconds for trial in found]
             axes[1, column].plot(values, times, "o-", color=f"C{i}", markersize=3)
         axes[1, column].set_xlabel(symbol)
         for axis in axes[:, column]:
             axis.grid(alpha=0.3)
-            if not tasks:
+            if not agents:
                 axis.text(0.5, 0.5, "not run", ha="center", transform=axis.transAxes)
     axes[0, 0].set_ylabel("return / largest |return|")
     axes[1, 0].set_ylabel("ms for an action")
-    if tasks:
+    if agents:
         axes[0, -1].legend(fontsize="x-small")
     header = ["task", "seed", "setting", "value", "return", "std over episodes", "ms"]
     text = (
@@ -106,6 +108,10 @@ def sensitivity(trials: Sequence[Trial]) -> Section:
         "`python benchmarks/paper/sensitivity.py`: horizon H, steps between two plans RH, "
         "candidates of the actor N_π, random candidates N_rand."
     )
+    played = sorted({(t.episodes, t.first_seed) for t in trials if t.first_seed < EVALUATION_SEED})
+    if played:
+        text += " Returns of " + " or ".join(f"{n} episodes of seed {seed:,}" for n, seed in played)
+        text += ", which no evaluation plays; the time of an action is that of a busy machine."
     looked_at = sorted({t.task for t in trials if t.first_seed >= EVALUATION_SEED})
     if looked_at:
         text += (
