@@ -73,12 +73,18 @@ def measure(task: str, seed: int, restarts: int, states: tuple[Tensor, ...]) -> 
     return found | {"origin": describe_origin(seed)}
 
 
-def kept_rows(results: Path, tasks: Sequence[str]) -> list[dict[str, Any]]:
-    """The rows of earlier measurements, but for those of tasks that are measured again."""
+def kept_rows(results: Path) -> list[dict[str, Any]]:
+    """The rows of earlier measurements."""
     path = results / "restarts.json"
     content = json.loads(path.read_text()) if path.is_file() else {"rows": []}
     older = {"origin": content["origin"]} if "origin" in content else {}
-    return [older | row for row in content["rows"] if row["task"] not in tasks]
+    return [older | row for row in content["rows"]]
+
+
+def with_row(rows: Sequence[dict[str, Any]], row: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows by task and seed, with this one in the place of an earlier one of the same."""
+    found = {(each["task"], each["seed"]): each for each in (*rows, row)}
+    return [found[key] for key in sorted(found)]
 
 
 def ratio(rows: list[dict[str, Any]]) -> tuple[float, float, float]:
@@ -125,13 +131,14 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    rows = kept_rows(arguments.results, arguments.tasks)
+    rows = kept_rows(arguments.results)
     for task in arguments.tasks:
         states = visited(task)
         for seed in arguments.seeds:
-            rows.append(measure(task, seed, arguments.restarts, states))
+            row = measure(task, seed, arguments.restarts, states)
+            rows = with_row(rows, row)
             write_tables(rows, arguments.results)
-            print(rows[-1], flush=True)
+            print(row, flush=True)
 
 
 if __name__ == "__main__":

@@ -117,7 +117,7 @@ def mean_of_seeds(values: Sequence[float], level: float = 0.95) -> Difference | 
 
 
 def mean_and_half(values: Sequence[float]) -> str:
-    """The same in words: the mean ± half of the interval.
+    """The mean over training seeds ± half of its 95 % interval, in words (:func:`mean_of_seeds`).
 
     Examples:
         >>> mean_and_half([1.0, 2.0, 3.0]), mean_and_half([-1.0])

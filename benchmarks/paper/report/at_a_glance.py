@@ -25,9 +25,8 @@ _PUBLISHED_VARIANTS = {"cartpole-swingup": "cartpole-swingup-published"}
 
 @dataclass(frozen=True)
 class _Compromise:
-    """What a system is on the three metrics, each a mean over the six tasks, and of which seeds."""
+    """What a system is on the three metrics, each a mean over the six tasks."""
 
-    seeds: str
     score: float
     samples: Between | None
     milliseconds: float | None
@@ -52,7 +51,7 @@ def at_a_glance(results: Results, turns: Turns | None = None) -> Section:
             [
                 system.name,
                 *_cells(ours, NOT_RUN),
-                NOT_RUN if ours is None else ours.seeds,
+                _seeds(results, system),
                 *_cells(theirs, "–"),
             ]
         )
@@ -98,13 +97,17 @@ def _measured(results: Results, turns: Turns, system: PaperSystem) -> _Compromis
     known = [time for time in times if time is not None]
     samples = [sample_efficiency(results, system, task) for task in SIX_TASKS]
     between = [each for each in samples if each is not None]
-    seeds = sorted({len(of_task) for of_task in scores})
     return _Compromise(
-        "–".join(map(str, dict.fromkeys((seeds[0], seeds[-1])))),
         fmean(fmean(score.normalised for score in of_task) for of_task in scores),
         mean_between(between) if len(between) == len(SIX_TASKS) else None,
         fmean(known) if len(known) == len(SIX_TASKS) else None,
     )
+
+
+def _seeds(results: Results, system: PaperSystem) -> str:
+    """How many a task has, from the fewest to the most, such as ``"3–10"``."""
+    counts = sorted({len(of_task) for of_task in results.averaged(system) or []})
+    return "–".join(map(str, dict.fromkeys((counts[0], counts[-1])))) if counts else NOT_RUN
 
 
 def _published(system: PaperSystem) -> _Compromise | None:
@@ -116,7 +119,6 @@ def _published(system: PaperSystem) -> _Compromise | None:
         return None
     samples = [1000 * row.samples for row in known if row.samples is not None]
     return _Compromise(
-        "10",
         fmean(normalise(t, row.return_mean) for t, row in zip(tasks, known, strict=True)),
         Between(fmean(samples), fmean(samples)) if len(samples) == len(tasks) else None,
         fmean(row.milliseconds for row in known),

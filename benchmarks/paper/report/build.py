@@ -84,7 +84,7 @@ def _of_the_proof(runs: Sequence[Run], problems: list[str]) -> list[Run]:
     """Those of the last proof, if there are any: others have played other episodes.
 
     Args:
-        runs: runs with one label.
+        runs: all finished runs.
         problems: where those that are left out are named.
     """
     proof = [run for run in runs if run.first_seed == PROOF_SEED]
@@ -116,14 +116,15 @@ def make_report(config: ReportConfig) -> Report:
             f"expected finished runs in {config.runs}, could read none of "
             f"{len(folders.problems)}; the first says: {folders.problems[0]}",
         )
-    chosen = _of_the_proof([run for run in folders.runs if run.label == config.label], problems)
+    runs = _of_the_proof(folders.runs, problems)
+    chosen = [run for run in runs if run.label == config.label]
     every = read_planned(Path(config.runs))
     planned = every.of(config.label)
     results = Results(chosen, planned)
     makers: dict[str, Callable[[], Section]] = {
         "The paper's claims": lambda: claims_section(results, turns),
         "At a glance": lambda: at_a_glance(results, turns),
-        "Planned and done": lambda: planned_section(every, folders.runs),
+        "Planned and done": lambda: planned_section(every, runs),
         "Soundness": lambda: soundness(chosen),
         "Main table": lambda: main_table(results),
         "Learning curves": lambda: learning_curves(results),
@@ -149,7 +150,7 @@ def make_report(config: ReportConfig) -> Report:
     write_report(Path(config.out), "Report", introduction, sections)
     if config.overview is not None:
         Path(config.overview).parent.mkdir(parents=True, exist_ok=True)
-        Path(config.overview).write_text(overview(folders.runs, every))
+        Path(config.overview).write_text(overview(runs, every))
     return Report(tuple(sections), tuple(problems))
 
 

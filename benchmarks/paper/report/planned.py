@@ -84,9 +84,7 @@ class Planned:
         sides = [
             {samples_of(cell) for cell in self._cells(system, task)} for system in (first, second)
         ]
-        return {n for n in set.union(*sides) if all({None, n} & side for side in sides)} - (
-            set() if all(None in side for side in sides) else {None}
-        )
+        return {n for n in set.union(*sides) if all({None, n} & side for side in sides)}
 
     def _cells(self, system: PaperSystem, task: str) -> list[Cell]:
         """Those of any of a system's methods on a task."""

@@ -35,11 +35,8 @@ def write_report(
 
     The same sections make the same files, byte by byte.
     """
-    for folder, ends in (("tables", ("csv",)), ("figures", ("svg", "png"))):
+    for folder in ("tables", "figures"):
         (directory / folder).mkdir(parents=True, exist_ok=True)
-        for end in ends:  # what an earlier report had and this one has not
-            for path in (directory / folder).glob(f"*.{end}"):
-                path.unlink()
     for section in sections:
         for table in section.tables.values():
             (directory / "tables" / f"{table.name}.csv").write_text(table.csv())

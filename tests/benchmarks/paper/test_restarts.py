@@ -7,7 +7,7 @@ import math
 import pytest
 
 from phihp_torchrl.origin import describe_origin
-from restarts import kept_rows, ratio, write_tables
+from restarts import kept_rows, ratio, with_row, write_tables
 
 ROWS = [
     {
@@ -42,5 +42,6 @@ def test_the_table_says_what_was_compared(tmp_path):
     page = (tmp_path / "README.md").read_text()
     assert "| cartpole-swingup | 250 | 20 to 22 | 0.04 | 0.02 | 0.50 (" in page
     assert "Restarts: 2." in page
-    assert kept_rows(tmp_path, ["pendulum"]) == ROWS
-    assert kept_rows(tmp_path, ["cartpole-swingup"]) == []
+    assert kept_rows(tmp_path) == ROWS
+    again = ROWS[1] | {"best": 0.03}
+    assert with_row(ROWS, again) == [ROWS[0], again, ROWS[2]]

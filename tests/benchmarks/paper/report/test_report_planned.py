@@ -13,6 +13,7 @@ from grid.cell import Cell, CellFiles
 from grid.keep import keep_failure, keep_names
 from measures import holm
 from phihp_torchrl.config import ConfigError
+from phihp_torchrl.evaluation import PROOF_SEED
 from report import Results, read_runs
 from report.claims import claims_section, hybrid_earns_more
 from report.planned import read_planned, samples_of
@@ -238,6 +239,18 @@ def test_baselines_that_were_planned_count_in_the_table_of_differences(tmp_path:
     make(tmp_path)
     (after,) = (row["p"] for row in table(tmp_path, "differences") if row["seeds"] == "4, 3")
     assert float(after) == pytest.approx(min(1.0, 2 * float(before)))
+
+
+def test_trials_beside_cells_of_the_proof_are_named_and_left_out(tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    for seed in (100, 101, 102):
+        config = make_run(runs, seed=seed) / "config.yaml"
+        config.write_text(config.read_text() + f"evaluate: {{first_seed: {PROOF_SEED}}}\n")
+    trial = make_run(runs, seed=0, acting={"planner": [-900.0], "actor": [-900.0]})
+    made = make(tmp_path)
+    assert [trial.name in problem for problem in made.problems] == [True]
+    assert table(tmp_path, "main_return")[0]["PhIHP seeds"] == "3"
+    assert "−900" not in (tmp_path / "overview.md").read_text()
 
 
 def test_a_plan_that_cannot_be_read_ends_the_report(tmp_path: Path) -> None:
