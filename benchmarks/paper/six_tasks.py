@@ -24,7 +24,7 @@ from phihp_torchrl.evaluation import PUBLISHED, REPORT_SEED, TARGETS, markdown_t
 from report.cells import configurations
 from report.overview import origins
 from report.runs import Run, read_runs
-from report.time_to_return import seconds_text
+from report.time_to_return import median_seconds_to
 from report.write import put_between
 
 RESULTS = Path("results/runs")
@@ -50,9 +50,9 @@ def chatter(run: Run, name: str) -> float:
 
 def times(runs: Sequence[Run], level: float) -> str:
     """The median of the seconds to a return, and how many runs got there, if not all."""
-    middle, reached = seconds_text(runs, level)
+    middle, reached = median_seconds_to(runs, level)
     text = "–" if middle is None else f"{middle:.0f}"
-    return text if reached == f"{len(runs)} of {len(runs)}" else f"{text} ({reached})"
+    return text if reached == len(runs) else f"{text} ({reached} of {len(runs)})"
 
 
 def spread(values: Sequence[float], digits: int) -> str:

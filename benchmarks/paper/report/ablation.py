@@ -8,9 +8,9 @@ from statistics import fmean
 
 from matplotlib.figure import Figure
 
-from measures import Between, mean_between
+from measures import Between
 from report.bounds import BOUNDS
-from report.efficiency import sample_efficiency, samples_cell
+from report.efficiency import mean_samples, samples_cell
 from report.paper_systems import PaperSystem, systems
 from report.results import SIX_TASKS, Results, Score
 from report.sections import Picture, Section
@@ -40,7 +40,7 @@ def ablation(results: Results) -> Section:
     digits = (3, 2)
     rows: list[list[TableCell]] = []
     for task, system in product((*SIX_TASKS, *results.others), compared):
-        scores, note = results.usual(system, task), results.unlike_usual(system, task)
+        scores, note = results.usual(system, task), results.samples_note(system, task)
         stats: list[TableCell] = [
             # Returns of a task without bounds are on no scale.
             "–" if i == 0 and task not in BOUNDS else Stat(tuple(_known(scores, value)), n, note)
@@ -95,8 +95,6 @@ def _bar(
     if not scores:
         return None
     if value is None:
-        samples = [sample_efficiency(results, system, task) for task in tasks]
-        known = [between for between in samples if between is not None]
-        return mean_between(known) if len(known) == len(tasks) else None
+        return mean_samples(results, system, tasks)
     values = [_known(of_task, value) for of_task in scores]
     return Between(0.0, fmean(map(fmean, values))) if all(values) else None

@@ -8,12 +8,12 @@ from statistics import fmean
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from measures import Between, mean_between
+from measures import Between
 from phihp_torchrl.evaluation import PUBLISHED
 from report.action_times import Turns, acting_time
 from report.bounds import normalise
 from report.claims import REDUCED, is_reduced
-from report.efficiency import sample_efficiency
+from report.efficiency import mean_samples
 from report.paper_systems import PaperSystem, systems
 from report.results import SIX_TASKS, Results
 from report.sections import Picture, Section
@@ -95,11 +95,9 @@ def _measured(results: Results, turns: Turns, system: PaperSystem) -> _Compromis
     preset = results.preset(system)
     times = [acting_time(turns, system, task, preset) for task in SIX_TASKS]
     known = [time for time in times if time is not None]
-    samples = [sample_efficiency(results, system, task) for task in SIX_TASKS]
-    between = [each for each in samples if each is not None]
     return _Compromise(
         fmean(fmean(score.normalised for score in of_task) for of_task in scores),
-        mean_between(between) if len(between) == len(SIX_TASKS) else None,
+        mean_samples(results, system, SIX_TASKS),
         fmean(known) if len(known) == len(SIX_TASKS) else None,
     )
 

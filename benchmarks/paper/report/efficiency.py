@@ -85,6 +85,13 @@ def sample_efficiency(results: Results, system: PaperSystem, task: str) -> Betwe
     return mean_between(found) if found else None
 
 
+def mean_samples(results: Results, system: PaperSystem, tasks: Sequence[str]) -> Between | None:
+    """What its mean over tasks lies between; ``None`` if nothing is known of one of them."""
+    samples = [sample_efficiency(results, system, task) for task in tasks]
+    known = [between for between in samples if between is not None]
+    return mean_between(known) if len(known) == len(tasks) else None
+
+
 def samples_cell(results: Results, system: PaperSystem, task: str) -> Ends | str:
     """The same for a table, with the number of seeds."""
     found = efficiency_of_seeds(results, system, task)

@@ -16,7 +16,7 @@ def main_table(results: Results) -> Section:
     """A table for each of the three metrics."""
 
     def returns(system: PaperSystem, task: str) -> Stat:
-        scores, note = results.usual(system, task), results.unlike_usual(system, task)
+        scores, note = results.usual(system, task), results.samples_note(system, task)
         return Stat(tuple(score.mean for score in scores), note=note)
 
     def samples(system: PaperSystem, task: str) -> Ends | str:
@@ -24,7 +24,7 @@ def main_table(results: Results) -> Section:
 
     def milliseconds(system: PaperSystem, task: str) -> Stat:
         times = (score.milliseconds for score in results.usual(system, task))
-        note = results.unlike_usual(system, task)
+        note = results.samples_note(system, task)
         return Stat(tuple(time for time in times if time is not None), 2, note)
 
     return Section(

@@ -16,7 +16,7 @@ from measures import (
 )
 from phihp_torchrl.evaluation import TARGETS, TaskResult, returns_table
 from report.comparison import numbers, unless_mixed
-from report.paper_systems import AGENT
+from report.paper_systems import AGENT, system
 from report.planned import Planned, samples_of
 from report.results import usual_samples
 from report.runs import Run
@@ -32,7 +32,7 @@ _SHARES = {
     "a hundredth": 0.01,
 }
 _WAYS = (AGENT, "actor")
-_WITH_ACTORS = {"phihp": "PhIHP", "dd-phihp": "dd-PhIHP"}
+_WITH_ACTORS = ("phihp", "dd-phihp")
 
 
 def both_ways(runs: Iterable[Run], method: str = "phihp") -> dict[tuple[str, int], list[Run]]:
@@ -118,10 +118,10 @@ def _gain_table(groups: dict[tuple[str, int], list[Run]], planned: Planned) -> T
 def _samples_table(runs: Sequence[Run]) -> Table:
     """Returns of PhIHP and of its twin without a prior, at each share of the published samples."""
     rows: list[list[TableCell]] = []
-    by_method = {system: both_ways(runs, method) for method, system in _WITH_ACTORS.items()}
+    by_system = {system(method).name: both_ways(runs, method) for method in _WITH_ACTORS}
     for task, published in PUBLISHED_SAMPLES.items():
-        for (system, groups), way in product(by_method.items(), _WAYS):
-            row: list[TableCell] = [f"{task}, {system}, {way}"]
+        for (name, groups), way in product(by_system.items(), _WAYS):
+            row: list[TableCell] = [f"{task}, {name}, {way}"]
             for share in _SHARES.values():
                 group = groups.get((task, round(published * share)), [])
                 row.append(Stat(tuple(means(group, way))))

@@ -59,11 +59,13 @@ def whole_seeds(numbers: Mapping[int, Collection[int]]) -> tuple[set[int], set[i
     counts = Counter(n for found in numbers.values() for n in found)
     wanted = well_filled(counts.elements())
     enough = FEWEST_SEEDS if max(counts.values(), default=0) >= FEWEST_SEEDS else 1
-    while len(seeds := {s for s, found in numbers.items() if wanted <= {*found}}) < enough and (
-        len(wanted) > 1
-    ):
+
+    def having_all() -> set[int]:
+        return {seed for seed, found in numbers.items() if wanted <= {*found}}
+
+    while len(having_all()) < enough and len(wanted) > 1:
         wanted.remove(min(wanted, key=lambda n: (counts[n], -n)))
-    return seeds, wanted
+    return having_all(), wanted
 
 
 def usual_samples(task: str, numbers: Iterable[int]) -> int:
@@ -190,7 +192,7 @@ class Results:
         }
         return scores if len(shares) < 2 else None
 
-    def unlike_usual(self, system: PaperSystem, task: str) -> str:
+    def samples_note(self, system: PaperSystem, task: str) -> str:
         """What stands beside the usual scores: their real samples, if not the default preset's."""
         for score in self.usual(system, task):
             default = DEFAULT_SAMPLES.get(task)

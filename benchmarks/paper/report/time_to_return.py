@@ -34,7 +34,7 @@ def time_to_return(runs: Sequence[Run], benchmarks: Path) -> Section:
             unknown: list[TableCell] = ["–"] * 3
             rows.append([task, str(samples), *unknown, Stat(tuple(whole), 0), "–", "–"])
             continue
-        known, reached = seconds_text(group, level)
+        known, reached = median_seconds_to(group, level)
         budget = None if milliseconds is None else milliseconds * PUBLISHED_UPDATES[task] / 1e3
         ratio = budget / known if budget and known else None
         rows.append(
@@ -42,7 +42,7 @@ def time_to_return(runs: Sequence[Run], benchmarks: Path) -> Section:
                 task,
                 str(samples),
                 Number(level, 0, fixed=True),
-                reached,
+                f"{reached} of {len(group)}",
                 Number(known, 0, fixed=True),
                 Stat(tuple(whole), 0),
                 Number(budget, 0, fixed=True),
@@ -81,8 +81,8 @@ def seconds_to(run: Run, level: float) -> float:
     return math.inf
 
 
-def seconds_text(runs: Sequence[Run], level: float) -> tuple[float | None, str]:
-    """The median of these seconds, and how many runs got there, such as ``"9 of 10"``.
+def median_seconds_to(runs: Sequence[Run], level: float) -> tuple[float | None, int]:
+    """The median of these seconds, and how many runs got there.
 
     A run that never did took longer than any; a mean over the others would flatter.
 
@@ -92,7 +92,7 @@ def seconds_text(runs: Sequence[Run], level: float) -> tuple[float | None, str]:
     needed = [seconds_to(run, level) for run in runs]
     middle = median(needed)
     reached = sum(seconds < math.inf for seconds in needed)
-    return middle if middle < math.inf else None, f"{reached} of {len(runs)}"
+    return middle if middle < math.inf else None, reached
 
 
 def _level(task: str) -> float | None:

@@ -274,14 +274,14 @@ def test_an_average_is_of_one_share_of_the_published_samples(tmp_path: Path) -> 
     found = results(tmp_path / "half").averaged(twin)
     assert found is not None
     assert [len(scores) for scores in found] == [3] * 6
-    assert results(tmp_path / "half").unlike_usual(twin, "pendulum") == ""
+    assert results(tmp_path / "half").samples_note(twin, "pendulum") == ""
     for seed in range(2, 7):  # pendulum is known best at 20 samples, though a half was run too
         make_run(tmp_path / "few", "dd-phihp", "pendulum", seed, 20, kind="data_driven")
     runs = [run for run in results(tmp_path / "half").runs if run.task != "pendulum"]
     mixed = Results([*runs, *results(tmp_path / "few").runs])
     assert mixed.averaged(twin) is None
     assert score_matrix(mixed, twin, SIX_TASKS) is None
-    assert mixed.unlike_usual(twin, "pendulum") == "20 samples"
+    assert mixed.samples_note(twin, "pendulum") == "20 samples"
     assert "(5; 20 samples)" in str(ablation(mixed).tables["By task"].markdown())
 
 
