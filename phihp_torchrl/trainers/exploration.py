@@ -19,6 +19,7 @@ from phihp_torchrl.config import (
     check_positive,
 )
 from phihp_torchrl.tasks import Task
+from phihp_torchrl.trainers.trust import CONTROLLER
 from phihp_torchrl.worlds import import_object, read_guards
 
 Controller = Callable[[Tensor], Any]
@@ -129,11 +130,9 @@ class Exploration:
         if config.coloured:
             self._check_bandwidth()
         if config.controller is not None:
-            self._controller = import_object(f"{_KEY}.controller", config.controller)
+            self._controller = import_object(CONTROLLER, config.controller)
             if not callable(self._controller):
-                raise ConfigError(
-                    f"{_KEY}.controller", f"expected a function, {config.controller} is none."
-                )
+                raise ConfigError(CONTROLLER, f"expected a function, {config.controller} is none.")
 
     def base(self, tensordict: TensorDictBase) -> Tensor:
         """The action ``[m]`` around which to explore: the trim, or the controller's.
@@ -143,7 +142,7 @@ class Exploration:
         """
         if self._controller is None:
             return self._trim
-        key, name = f"{_KEY}.controller", self.config.controller
+        key, name = CONTROLLER, self.config.controller
         if _starts(tensordict) and hasattr(self._controller, "reset"):
             self._controller.reset()
         try:
